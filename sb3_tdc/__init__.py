@@ -1,0 +1,8 @@
+"""TDC-λ for Stable-Baselines3: ``from sb3_tdc import TDC``."""
+
+from importlib.metadata import version
+
+from sb3_tdc.tdc import TDC, NonFiniteError
+
+__version__ = version("sb3-tdc")
+__all__ = ["TDC", "NonFiniteError", "__version__"]

@@ -1,0 +1,233 @@
+"""Networks of TDC-λ: SB3's own actors, and quantile critics evaluated all at once."""
+
+import math
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import Actor as TanhGaussianActor
+from stable_baselines3.td3.policies import Actor as DeterministicActor
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+from sb3_tdc.tdc.checks import check_integer
+
+
+class StackedLinear(nn.Module):
+    """
+    One ``nn.Linear`` per critic, as a single batched matrix product. Initialised like ``nn.Linear``.
+
+    :param n_critics: C
+    :param in_features: features in
+    :param out_features: features out
+    """
+
+    def __init__(self, n_critics: int, in_features: int, out_features: int):
+        super().__init__()
+        self.weight = nn.Parameter(th.empty(n_critics, in_features, out_features))
+        self.bias = nn.Parameter(th.empty(n_critics, 1, out_features))
+        bound = 1 / math.sqrt(in_features) if in_features > 0 else 0.0
+        nn.init.uniform_(self.weight, -bound, bound)
+        nn.init.uniform_(self.bias, -bound, bound)
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """(B, in), shared by the critics, or (C, B, in) → (C, B, out)."""
+        return th.baddbmm(self.bias, inputs.expand(len(self.weight), -1, -1), self.weight)
+
+    def forward_first(self, inputs: th.Tensor) -> th.Tensor:
+        """(B, in) → (B, out), through the first critic alone."""
+        return th.addmm(self.bias[0], inputs, self.weight[0])
+
+    def extra_repr(self) -> str:
+        n_critics, in_features, out_features = self.weight.shape
+        return f"n_critics={n_critics}, in_features={in_features}, out_features={out_features}"
+
+
+class QuantileCritic(ContinuousCritic):
+    """
+    C critics that each predict the return as N quantiles (Eq. 3), stacked layer by layer.
+
+    Features extraction and its sharing rule are ``ContinuousCritic``'s. An activation with parameters
+    (``nn.PReLU``) is shared by the critics.
+
+    :param n_quantiles: N, quantiles per critic, at least 1
+    :param n_critics: C, at least 1
+    :raises ValueError: if either is below 1
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+        n_quantiles: int = 64,
+        n_critics: int = 2,
+        share_features_extractor: bool = True,
+    ):
+        check_integer("n_quantiles", n_quantiles, minimum=1)
+        check_integer("n_critics", n_critics, minimum=1)
+        super().__init__(
+            observation_space,
+            action_space,
+            net_arch,
+            features_extractor,
+            features_dim,
+            activation_fn,
+            normalize_images,
+            n_critics=0,  # the scalar networks of the parent are not built
+            share_features_extractor=share_features_extractor,
+        )
+        self.n_critics = n_critics
+        self.n_quantiles = n_quantiles
+        layers: list[nn.Module] = []
+        in_features = features_dim + get_action_dim(action_space)
+        for width in net_arch:
+            layers += [StackedLinear(n_critics, in_features, width), activation_fn()]
+            in_features = width
+        self.layers = nn.ModuleList([*layers, StackedLinear(n_critics, in_features, n_quantiles)])
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:  # type: ignore[override]
+        """
+        Quantiles of every critic (Eq. 3).
+
+        :param obs: (B, ...) observations
+        :param actions: (B, A) actions in [-1, 1]
+        :return: (B, C, N)
+        """
+        # A features extractor shared with the actor learns from the actor's loss only
+        with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
+            features = self.extract_features(obs, self.features_extractor)
+        hidden = th.cat([features, actions], dim=1)
+        for layer in self.layers:
+            hidden = layer(hidden)
+        return hidden.transpose(0, 1)
+
+    def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Value for the actor: the mean of the first critic's quantiles (Eq. 11).
+
+        :param obs: (B, ...) observations
+        :param actions: (B, A) actions in [-1, 1]
+        :return: (B, 1)
+        """
+        with th.no_grad():
+            features = self.extract_features(obs, self.features_extractor)
+        hidden = th.cat([features, actions], dim=1)
+        for layer in self.layers:
+            hidden = layer.forward_first(hidden) if isinstance(layer, StackedLinear) else layer(hidden)
+        return hidden.mean(dim=1, keepdim=True)
+
+
+class TDCPolicy(TD3Policy):
+    """
+    Policy class (actor, quantile critics and the targets of both) for TDC-λ.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: Hidden layers, ``[256, 256]`` by default, or ``dict(pi=[...], qf=[...])``
+    :param activation_fn: Activation function
+    :param features_extractor_class: Features extractor to use
+    :param features_extractor_kwargs: Keyword arguments to pass to the features extractor
+    :param normalize_images: Whether to divide images by 255
+    :param optimizer_class: The optimizer, ``th.optim.Adam`` by default (then the fused one)
+    :param optimizer_kwargs: Additional keyword arguments for the optimizer, without the learning rate
+    :param n_critics: Number of critics C
+    :param share_features_extractor: Whether the actor and the critics share one features extractor
+    :param n_quantiles: Quantiles per critic N_q
+    :param stochastic_actor: ζ: a tanh-Gaussian head (True) or a deterministic one (False)
+    """
+
+    actor: DeterministicActor | TanhGaussianActor  # type: ignore[assignment]
+    actor_target: DeterministicActor | TanhGaussianActor  # type: ignore[assignment]
+    critic: QuantileCritic
+    critic_target: QuantileCritic
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        share_features_extractor: bool = False,
+        n_quantiles: int = 64,
+        stochastic_actor: bool = False,
+    ):
+        # TD3Policy's constructor builds the networks: what they need is set first
+        self.n_quantiles = n_quantiles
+        self.stochastic_actor = stochastic_actor
+        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
+            optimizer_kwargs = {"fused": True}
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            [256, 256] if net_arch is None else net_arch,
+            activation_fn,
+            features_extractor_class,
+            features_extractor_kwargs,
+            normalize_images,
+            optimizer_class,
+            optimizer_kwargs,
+            n_critics,
+            share_features_extractor,
+        )
+
+    def make_actor(  # type: ignore[override]
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> DeterministicActor | TanhGaussianActor:
+        actor_class = TanhGaussianActor if self.stochastic_actor else DeterministicActor
+        actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return actor_class(**actor_kwargs).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> QuantileCritic:
+        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return QuantileCritic(**critic_kwargs, n_quantiles=self.n_quantiles).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(n_quantiles=self.n_quantiles, stochastic_actor=self.stochastic_actor)
+        return data
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        # The mean action for both heads, whatever `deterministic` says (Eq. 15 and 19)
+        return self.actor._predict(observation, deterministic=True)
+
+
+MlpPolicy = TDCPolicy
+
+
+class CnnPolicy(TDCPolicy):
+    """:class:`TDCPolicy` with ``NatureCNN`` features; the same parameters, by keyword."""
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class MultiInputPolicy(TDCPolicy):
+    """:class:`TDCPolicy` for ``Dict`` observations; the same parameters, by keyword."""
+
+    def __init__(
+        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
+    ):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

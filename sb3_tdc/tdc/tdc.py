@@ -1,0 +1,449 @@
+"""TDC-λ as a Stable-Baselines3 algorithm. ``train()`` follows Algorithm 1 of the paper, phase by phase."""
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
+from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
+from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
+from sb3_tdc.tdc.quantiles import (
+    mean_and_std,
+    quantile_huber_gradient,
+    quantile_huber_loss,
+    select_critic,
+    take_critic,
+    td_target,
+)
+
+SelfTDC = TypeVar("SelfTDC", bound="TDC")
+
+# The critics' diagnostics (docs/tdc.md) are taken at every tenth update: all of them would cost a tenth of the speed
+DIAGNOSTICS_INTERVAL = 10
+
+
+class TDC(OffPolicyAlgorithm):
+    """
+    Twin Distributional Critics with a λ-lower confidence bound (TDC-λ), Osman et al.
+
+    TD3 with quantile critics: the target is taken, per transition, from the target critic with the smaller
+    mean − λ·std of its quantiles, and the head may be deterministic (TD3's) or tanh-Gaussian (SAC's).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: η_π, learning rate of the actor (and of the temperature), or a schedule of the
+        progress remaining (from 1 to 0)
+    :param buffer_size: size of the replay buffer, in transitions
+    :param learning_starts: random steps before learning starts
+    :param batch_size: minibatch size for each gradient update
+    :param tau: τ, the Polyak coefficient, between 0 and 1
+    :param gamma: γ, the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps, or ``(5, "step")``, ``(2, "episode")``
+    :param gradient_steps: How many gradient steps to do after each rollout;
+        -1: as many as steps done in the environment
+    :param action_noise: exploration noise added to the mean action: an ``ActionNoise``, or σ_explore, the standard
+        deviation of Gaussian noise in normalised action units ([-1, 1]), or None for no noise
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
+    :param n_steps: n-step returns if > 1 (with the ``NStepReplayBuffer``)
+    :param lam: λ ≥ 0, the weight of the spread in the selection of the target critic (Eq. 5), or a schedule. λ only
+        selects; 0 takes the smaller mean (TD3's clipped double), and a larger λ never gives a smaller target mean
+    :param stochastic_actor: ζ: a tanh-Gaussian head trained with entropy (True), or a deterministic one (False).
+        Exploration and evaluation use the mean action with both
+    :param qf_learning_rate: η_Q, learning rate of the critics, or a schedule; None: as ``learning_rate``
+    :param kappa: κ ≥ 0, threshold of the quantile-Huber loss, in units of return; 0: plain quantile regression
+    :param policy_delay: d, updates of the critics per update of the actor and the targets
+    :param target_policy_noise: σ_tgt, standard deviation of the target policy smoothing noise (deterministic head),
+        in normalised action units
+    :param target_noise_clip: c, its limit, in normalised action units
+    :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` from 0.1 on,
+        a number fixes it
+    :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
+    :param stats_window_size: Window size, in episodes, of the rollout statistics
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
+        ``net_arch`` ([256, 256]), ... (see :class:`~sb3_tdc.tdc.policies.TDCPolicy`)
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: for an argument out of range, by name, before the networks and the buffer are built
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: TDCPolicy
+    replay_buffer: ReplayBuffer
+
+    def __init__(
+        self,
+        policy: str | type[TDCPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 5_000,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | float | None = 0.1,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        lam: float | Schedule = 1.0,
+        stochastic_actor: bool = False,
+        qf_learning_rate: float | Schedule | None = None,
+        kappa: float = 1.0,
+        policy_delay: int = 2,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        ent_coef: str | float = "auto",
+        target_entropy: str | float = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if env is not None:  # None when a model is loaded without one
+            env = maybe_make_env(env, verbose)
+            check_action_space(env.action_space)
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,  # type: ignore[arg-type]  # a number becomes noise in _setup_model
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs={**(policy_kwargs or {}), "stochastic_actor": stochastic_actor},
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.lam = lam
+        self.stochastic_actor = stochastic_actor
+        self.qf_learning_rate = qf_learning_rate
+        self.kappa = kappa
+        self.policy_delay = policy_delay
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.ent_coef = ent_coef
+        self.target_entropy = target_entropy
+
+        if _init_setup_model:
+            self._setup_model()
+
+    # ---------------------------------------------------------------- set-up
+
+    def _check_arguments(self) -> None:
+        for name, maximum in (("tau", 1.0), ("gamma", 1.0)):
+            check_number(name, getattr(self, name), 0.0, maximum)
+        for name in ("kappa", "target_policy_noise", "target_noise_clip"):
+            check_number(name, getattr(self, name), 0.0)
+        for name, minimum in (("buffer_size", 1), ("batch_size", 1), ("n_steps", 1), ("policy_delay", 1)):
+            check_integer(name, getattr(self, name), minimum)
+        check_integer("learning_starts", self.learning_starts, 0)
+        check_integer("gradient_steps", self.gradient_steps, -1)
+        for name in ("n_quantiles", "n_critics"):
+            check_integer(f"policy_kwargs[{name!r}]", self.policy_kwargs.get(name, 1), 1)
+        if self.action_noise is not None and not isinstance(self.action_noise, ActionNoise):
+            check_number("action_noise (if not an ActionNoise or None)", self.action_noise, 0.0)
+        if self.target_entropy != "auto":
+            check_number('target_entropy (if not "auto")', self.target_entropy)
+        self._initial_ent_coef()
+        for name in ("lam", "learning_rate", "qf_learning_rate"):
+            self._scheduled(name, progress_remaining=1.0)
+
+    def _initial_ent_coef(self) -> float:
+        coefficient = self.ent_coef
+        if isinstance(coefficient, str) and coefficient.startswith("auto"):
+            coefficient = coefficient.removeprefix("auto").removeprefix("_") or "1.0"
+        try:
+            value = check_number("ent_coef", float(coefficient), 0.0)
+            if value > 0 or not self._learns_ent_coef:
+                return value
+        except ValueError:
+            pass
+        raise ValueError(
+            'ent_coef must be "auto", "auto_" and a positive number (as in "auto_0.1"), '
+            f"or a number of at least 0, got {self.ent_coef!r}"
+        )
+
+    @property
+    def _learns_ent_coef(self) -> bool:
+        return isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto")
+
+    def _scheduled(self, name: str, progress_remaining: float | None = None) -> float:
+        """The current value of ``lam``, ``learning_rate`` or ``qf_learning_rate``, checked."""
+        value = getattr(self, name)
+        if value is None and name == "qf_learning_rate":
+            return self._scheduled("learning_rate", progress_remaining)
+        if not callable(value):
+            return check_number(name, value, 0.0)
+        progress = self._current_progress_remaining if progress_remaining is None else progress_remaining
+        return check_number(f"{name} (a schedule, at progress remaining {progress:.4g})", value(progress), 0.0)
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        self._setup_action_noise()
+        super()._setup_model()
+        self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
+        self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
+        # With a shared features extractor the actor and the critics have parameters in common: Polyak moves them once
+        self._online_parameters = _unique([*self.critic.parameters(), *self.actor.parameters()])
+        self._target_parameters = _unique([*self.critic_target.parameters(), *self.actor_target.parameters()])
+        # Running statistics of batch norm
+        self._online_statistics, self._target_statistics = (
+            [tensor for network in networks for tensor in get_parameters_by_name(network, ["running_"])]
+            for networks in ((self.critic, self.actor), (self.critic_target, self.actor_target))
+        )
+        self._diagnostics = Diagnostics()
+        if self.stochastic_actor:
+            self._setup_temperature()
+
+    def _setup_action_noise(self) -> None:
+        noise: Any = self.action_noise
+        if isinstance(noise, VectorizedActionNoise):
+            noise = noise.base_noise  # learn() wraps it again, for its number of environments
+        elif noise is not None and not isinstance(noise, ActionNoise):
+            shape = self.action_space.shape
+            assert shape is not None
+            noise = NormalActionNoise(np.zeros(shape), np.full(shape, float(noise)))
+        self.action_noise = noise
+
+    def _setup_temperature(self) -> None:
+        self._target_entropy = (
+            -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+            if self.target_entropy == "auto"
+            else float(self.target_entropy)
+        )
+        initial = th.tensor([self._initial_ent_coef()], device=self.device)
+        if self._learns_ent_coef:
+            self.log_ent_coef = initial.log().requires_grad_(True)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self._scheduled("learning_rate"))
+        else:
+            self.ent_coef_tensor = initial
+
+    # ---------------------------------------------------------------- Algorithm 1
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """
+        Algorithm 1, from the minibatch to the targets, ``gradient_steps`` times.
+
+        :param gradient_steps: number of updates
+        :param batch_size: B, transitions per update
+        :raises ValueError: if a schedule returns something that is not allowed
+        :raises NonFiniteError: if a loss has been seen to be NaN or infinite
+        """
+        self.policy.set_training_mode(True)
+        lam = self._scheduled("lam")
+        self._update_learning_rates()
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            self._update_critics(replay_data, lam)
+            if self._n_updates % self.policy_delay == 0:
+                self._update_actor(replay_data)
+                self._update_targets()
+
+    def _update_learning_rates(self) -> None:
+        learning_rate = self._scheduled("learning_rate")
+        update_learning_rate(self.actor.optimizer, learning_rate)  # type: ignore[arg-type]
+        update_learning_rate(self.critic.optimizer, self._scheduled("qf_learning_rate"))
+        if self.stochastic_actor and self._learns_ent_coef:
+            update_learning_rate(self.ent_coef_optimizer, learning_rate)
+
+    def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
+        """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""
+        if self.stochastic_actor:
+            return self.actor_target(replay_data.next_observations, deterministic=False)
+        noise = th.randn_like(replay_data.actions).mul_(self.target_policy_noise)
+        noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
+        return noise.add_(self.actor_target(replay_data.next_observations)).clamp_(-1, 1)
+
+    def _update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
+        # n-step returns carry their own discounts
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        with th.no_grad():
+            next_actions = self._sample_target_actions(replay_data)
+            next_quantiles = self.critic_target(replay_data.next_observations, next_actions)  # Eq. 3
+            mean, std = mean_and_std(next_quantiles)  # Eq. 4
+            selected = select_critic(mean, std, lam)  # Eq. 5
+            target_quantiles = td_target(  # Eq. 6–7
+                replay_data.rewards, replay_data.dones, discounts, take_critic(next_quantiles, selected)
+            )
+        current_quantiles = self.critic(replay_data.observations, replay_data.actions)
+
+        # Only the gradient of the loss (Eq. 8–10) is needed to learn
+        self.critic.optimizer.zero_grad()
+        current_quantiles.backward(quantile_huber_gradient(current_quantiles, target_quantiles, self.kappa))
+        self.critic.optimizer.step()
+
+        if self._n_updates % DIAGNOSTICS_INTERVAL == 1:
+            self._diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, selected)
+
+    def _update_actor(self, replay_data: ReplayBufferSamples) -> None:
+        diagnostics = {}
+        if self.stochastic_actor:
+            actions, log_prob = self.actor.action_log_prob(replay_data.observations)  # type: ignore[operator]
+            ent_coef = self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
+            q_values = self.critic.q1_forward(replay_data.observations, actions)  # Eq. 11
+            actor_loss = (ent_coef * log_prob.unsqueeze(1) - q_values).mean()  # Eq. 13
+            log_prob = log_prob.detach()
+            diagnostics.update(entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
+        else:
+            actions = self.actor(replay_data.observations)
+            actor_loss = -self.critic.q1_forward(replay_data.observations, actions).mean()  # Eq. 11–12
+        self._minimize(actor_loss, self.actor.optimizer)  # type: ignore[arg-type]
+        if self.stochastic_actor and self._learns_ent_coef:
+            ent_coef_loss = -(self.log_ent_coef * (log_prob + self._target_entropy)).mean()  # Eq. 14
+            self._minimize(ent_coef_loss, self.ent_coef_optimizer)
+            diagnostics["ent_coef_loss"] = ent_coef_loss.detach()
+        self._diagnostics.add(self._n_updates, self.num_timesteps, {"actor_loss": actor_loss.detach(), **diagnostics})
+
+    @staticmethod
+    def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
+        optimizer.zero_grad()
+        # Gradients of these parameters alone: the critics stay as they are, and cost nothing
+        loss.backward(inputs=[parameter for group in optimizer.param_groups for parameter in group["params"]])
+        optimizer.step()
+
+    @th.no_grad()
+    def _update_targets(self) -> None:
+        th._foreach_lerp_(self._target_parameters, self._online_parameters, self.tau)  # Eq. 16
+        for target, online in zip(self._target_statistics, self._online_statistics, strict=True):
+            target.copy_(online)
+
+    # ---------------------------------------------------------------- logging
+
+    def _diagnose_critics(
+        self, current: th.Tensor, target: th.Tensor, mean: th.Tensor, std: th.Tensor, selected: th.Tensor
+    ) -> None:
+        """Shapes (B, C, N), (B, N), (B, C), (B, C), (B,); each figure is described in docs/tdc.md."""
+        td_errors = target.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
+        values = {
+            "critic_loss": quantile_huber_loss(current, target, self.kappa),  # Eq. 10
+            "target_mean": target.mean(),
+            "target_std": std.gather(1, selected.unsqueeze(1)).mean(),
+            "critic_disagreement": (mean.amax(dim=1) - mean.amin(dim=1)).mean(),
+            "td_error_var": td_errors.var(dim=0, correction=0).mean(),
+        }
+        for i in range(mean.shape[1]):
+            values[f"critic_{i + 1}_selected"] = (selected == i).float().mean()
+        self._diagnostics.add(self._n_updates, self.num_timesteps, values)
+
+    def dump_logs(self) -> None:
+        """Write log data; what was measured in training since the last time is fetched from the device here."""
+        means = self._diagnostics.fetch()
+        for name, value in means.items():
+            self.logger.record(f"train/{name}", value)
+        if means:
+            for name in ("lam", "learning_rate", "qf_learning_rate"):
+                self.logger.record(f"train/{name}", self._scheduled(name))
+            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        super().dump_logs()
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        observations = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
+        for name, array in ("action", buffer_action), ("reward", reward), *observations.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
+                source = "policy chose an" if name == "action" else "environment returned a non-finite"
+                raise NonFiniteError(
+                    f"The {source} {name} of {array} at timestep {self.num_timesteps} (update {self._n_updates}). "
+                    "Training has stopped; the transition was not stored."
+                )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def learn(
+        self: SelfTDC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "TDC",
+        *args: Any,
+        **kwargs: Any,
+    ) -> SelfTDC:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
+
+    # ---------------------------------------------------------------- saving
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file.
+
+        :param path: path to the file where the rl agent should be saved
+        :param exclude: name of parameters that should be excluded in addition to the default ones
+        :param include: name of parameters that might be excluded but should be included anyway
+        :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
+        """
+        broken = [name for name, weight in self.policy.state_dict().items() if not weight.isfinite().all()]
+        if broken:
+            raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
+        super().save(path, exclude, include)
+
+    def _excluded_save_params(self) -> list[str]:
+        networks = ["actor", "actor_target", "critic", "critic_target"]
+        derived = ["_online_parameters", "_target_parameters", "_online_statistics", "_target_statistics"]
+        return [*super()._excluded_save_params(), *networks, *derived, "_diagnostics"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
+        if not self.stochastic_actor:
+            return state_dicts, []
+        if not self._learns_ent_coef:
+            return state_dicts, ["ent_coef_tensor"]
+        return [*state_dicts, "ent_coef_optimizer"], ["log_ent_coef"]
+
+
+def _unique(parameters: list[th.nn.Parameter]) -> list[th.nn.Parameter]:
+    return list({id(parameter): parameter for parameter in parameters}.values())
