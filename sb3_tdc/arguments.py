@@ -1,0 +1,87 @@
+"""What the command lines of ``train.py`` and ``enjoy.py`` have in common."""
+
+import argparse
+import importlib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn
+
+import torch as th
+import yaml
+
+from sb3_tdc.hyperparams import suggest
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that names the nearest flag for a misspelt one."""
+
+    def __init__(self, description: str):
+        super().__init__(
+            description=description, allow_abbrev=False, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        )
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            flags = [flag for action in self._actions for flag in action.option_strings]
+            self.error(f"unknown argument {unknown[0]!r}{suggest(unknown[0], flags)}")
+        return parsed
+
+    def fail(self, error: Exception) -> NoReturn:
+        """Print one sentence and leave with status 2, as for a bad argument."""
+        self.exit(2, f"{self.prog}: error: {error}\n")
+
+
+class KeyValues(argparse.Action):
+    """``key:value key:value`` → a dict; the values are YAML, never evaluated."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        pairs = {}
+        for text in values:
+            key, colon, value = text.partition(":")
+            if not colon or not key:
+                raise argparse.ArgumentError(self, f"must be key:value, got {text!r}")
+            try:
+                pairs[key] = yaml.safe_load(value)
+            except yaml.YAMLError:
+                raise argparse.ArgumentError(self, f"the value of {key} is not valid YAML: {value!r}") from None
+        setattr(namespace, self.dest, pairs)
+
+
+def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
+    """:return: an argument type that takes one of the known names, and else names the nearest"""
+
+    def check(name: str) -> str:
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"unknown {kind} {name!r}{suggest(name, known)}; known: {', '.join(known)}")
+        return name
+
+    return check
+
+
+def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:
+    """The flags that training and enjoying share, as in RL Zoo."""
+    parser.add_argument("--algo", type=one_of("algorithm", algorithms), default="tdc", help="algorithm")
+    parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
+    parser.add_argument("--num-threads", type=int, default=-1, help="threads for PyTorch (-1: PyTorch's default)")
+    parser.add_argument("--device", default="auto", help="PyTorch device (cpu, cuda, ...)")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
+    parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the environment")
+
+
+def apply_common_arguments(args: argparse.Namespace) -> None:
+    """
+    Import the packages that register environments, and set the number of threads.
+
+    :raises ValueError: for a package that is not installed, with the command that installs it
+    """
+    for package in args.gym_packages:
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            raise ValueError(f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}") from error
+    if args.num_threads > 0:
+        th.set_num_threads(args.num_threads)

@@ -1,0 +1,335 @@
+"""One run: environments, model, callbacks, run folder. Called by the command line, by searches and by tests."""
+
+import difflib
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import (
+    CSVOutputFormat,
+    HParam,
+    HumanOutputFormat,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+)
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import get_latest_run_id
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecFrameStack,
+    VecNormalize,
+    unwrap_vec_normalize,
+)
+
+from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.progress import ProgressCallback
+from sb3_tdc.run_folder import RunFolder, save_model
+from sb3_tdc.tdc import TDC
+
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "td3": TD3, "sac": SAC, "ddpg": DDPG}
+
+
+@dataclass
+class Experiment:
+    """
+    What one run is made of, besides its hyperparameters.
+
+    :param algo: a key of ``ALGORITHMS``
+    :param env_id: a registered environment
+    :param eval_freq: environment steps between evaluations; 0 or less: none
+    :param eval_episodes: episodes per evaluation, with the mean action
+    :param save_freq: environment steps between saved models; 0 or less: none
+    :param tensorboard_log: "" for none; None for the run's own folder
+    :param trained_model: a zip to go on from; its replay buffer and normalisation are loaded if they lie beside it
+    :param log_interval: episodes between log entries; None for none
+    """
+
+    algo: str
+    env_id: str
+    hyperparams: Hyperparams
+    folder: RunFolder
+    seed: int
+    eval_freq: int = 20_000
+    eval_episodes: int = 5
+    n_eval_envs: int = 1
+    save_freq: int = -1
+    save_replay_buffer: bool = False
+    vec_env: str = "dummy"
+    device: str = "auto"
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
+    tensorboard_log: str | None = None
+    trained_model: Path | None = None
+    log_interval: int | None = 4
+    progress_bar: bool = False
+    verbose: int = 1
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended: the trained model, and whether the user stopped it before its last step."""
+
+    model: OffPolicyAlgorithm
+    interrupted: bool
+
+
+def check_env_id(env_id: str) -> None:
+    """:raises ValueError: naming the nearest environment, if it is not registered"""
+    if ":" in env_id or env_id in gym.registry:  # "module:Env-v0" registers itself when it is made
+        return
+    close = difflib.get_close_matches(env_id, gym.registry, n=3)
+    nearest = f"; did you mean {' or '.join(close)}?" if close else ""
+    raise ValueError(
+        f"There is no environment {env_id!r}{nearest} "
+        "An environment of another package is registered by --gym-packages PACKAGE."
+    )
+
+
+def make_envs(
+    env_id: str,
+    hyperparams: Hyperparams,
+    seed: int,
+    n_envs: int,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_env: str = "dummy",
+    monitor_folder: Path | None = None,
+    normalization: Path | None = None,
+    training: bool = True,
+) -> VecEnv:
+    """
+    The environments of a run, wrapped as its hyperparameters say.
+
+    :param env_kwargs: of the environment's constructor, over those of the hyperparameters
+    :param vec_env: "dummy" (one process) or "subproc"
+    :param monitor_folder: for ``*.monitor.csv``
+    :param normalization: saved statistics for ``VecNormalize``
+    :param training: False: statistics stay as they are and rewards are not normalised
+    """
+
+    def wrap(env: gym.Env) -> gym.Env:
+        for wrapper in hyperparams.env_wrapper:
+            env = wrapper(env)
+        return env
+
+    env = make_vec_env(
+        gym.spec(env_id).make,
+        n_envs=n_envs,
+        seed=seed,
+        monitor_dir=str(monitor_folder) if monitor_folder else None,
+        monitor_kwargs=hyperparams.monitor_kwargs,
+        wrapper_class=wrap,
+        env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
+        vec_env_cls={"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[vec_env],
+    )
+    for wrapper in hyperparams.vec_env_wrapper:
+        env = wrapper(env)
+    if hyperparams.normalize is not None:
+        if normalization is not None:
+            env = VecNormalize.load(str(normalization), env)
+        else:
+            env = VecNormalize(env, **hyperparams.normalize)
+        if not training:
+            env.training, env.norm_reward = False, False
+    if hyperparams.frame_stack is not None:
+        env = VecFrameStack(env, hyperparams.frame_stack)
+    return env
+
+
+def train(experiment: Experiment) -> Outcome:
+    """
+    Train from the first step to the last, or to Ctrl-C; either way the model is saved.
+
+    :raises NonFiniteError: if training diverged; saved models stay as they are
+    """
+    env = _make_training_envs(experiment)
+    model = _make_model(experiment, env)
+    eval_env = None
+    progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
+    try:
+        model.set_logger(_make_logger(experiment))
+        if experiment.eval_freq > 0:
+            eval_env = model._wrap_env(_make_eval_envs(experiment), verbose=0, monitor_wrapper=False)
+        interrupted = False
+        try:
+            model.learn(
+                experiment.hyperparams.n_timesteps,
+                callback=[*_make_callbacks(experiment, eval_env, progress), progress],
+                log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
+            )
+        except KeyboardInterrupt:
+            interrupted = True
+        _save(experiment, model)
+        return Outcome(model, interrupted)
+    finally:
+        progress.close()
+        for envs in (env, eval_env):
+            _close(envs)
+        if model._logger is not None:
+            model.logger.close()
+
+
+def _make_training_envs(experiment: Experiment) -> VecEnv:
+    normalization = None
+    if experiment.trained_model is not None and experiment.hyperparams.normalize is not None:
+        run = RunFolder(experiment.trained_model.parent, experiment.folder.env_name)
+        normalization = run.normalization(experiment.trained_model)
+    return make_envs(
+        experiment.env_id,
+        experiment.hyperparams,
+        experiment.seed,
+        experiment.hyperparams.n_envs,
+        experiment.env_kwargs,
+        experiment.vec_env,
+        monitor_folder=experiment.folder.path,
+        normalization=normalization,
+    )
+
+
+def _make_eval_envs(experiment: Experiment) -> VecEnv:
+    return make_envs(
+        experiment.env_id,
+        experiment.hyperparams,
+        experiment.seed + 1_000,  # other initial states than in training
+        experiment.n_eval_envs,
+        experiment.eval_env_kwargs or experiment.env_kwargs,
+        experiment.vec_env,
+        training=False,
+    )
+
+
+def _make_model(experiment: Experiment, env: VecEnv) -> OffPolicyAlgorithm:
+    algorithm = ALGORITHMS[experiment.algo]
+    kwargs = dict(experiment.hyperparams.model)
+    noise = _make_action_noise(experiment.hyperparams, env)
+    if noise is not None:
+        kwargs["action_noise"] = noise
+    kwargs.update(seed=experiment.seed, device=experiment.device, verbose=int(experiment.verbose > 1))
+    if experiment.trained_model is None:
+        return algorithm(env=env, **kwargs)
+
+    for of_the_saved_model in ("policy", "policy_kwargs"):
+        kwargs.pop(of_the_saved_model, None)
+    model = algorithm.load(experiment.trained_model, env=env, **kwargs)
+    replay_buffer = experiment.trained_model.with_name(experiment.folder.replay_buffer.name)
+    if replay_buffer.exists():
+        model.load_replay_buffer(replay_buffer)
+    return model
+
+
+def _make_action_noise(hyperparams: Hyperparams, env: VecEnv) -> ActionNoise | None:
+    if hyperparams.noise_type is None:
+        return None
+    noise = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}[hyperparams.noise_type]
+    shape = env.action_space.shape
+    assert shape is not None
+    return noise(np.zeros(shape), np.full(shape, hyperparams.noise_std))
+
+
+def _make_logger(experiment: Experiment) -> Logger:
+    folder = experiment.folder.path
+    writers: list[KVWriter] = [CSVOutputFormat(str(folder / "progress.csv"))]
+    if experiment.tensorboard_log is None:
+        writers.append(TensorBoardOutputFormat(str(folder)))
+    elif experiment.tensorboard_log:
+        parent = Path(experiment.tensorboard_log) / experiment.folder.env_name
+        name = experiment.algo.upper()
+        writers.append(TensorBoardOutputFormat(str(parent / f"{name}_{get_latest_run_id(str(parent), name) + 1}")))
+    if experiment.verbose > 1:
+        writers.append(HumanOutputFormat(sys.stdout))
+    return Logger(str(folder), writers)
+
+
+def _make_callbacks(
+    experiment: Experiment, eval_env: VecEnv | None, progress: ProgressCallback
+) -> list[BaseCallback]:
+    hyperparams, folder = experiment.hyperparams, experiment.folder
+    callbacks = [*(make() for make in hyperparams.callbacks), _HParamsCallback(experiment)]
+
+    def calls(freq: int) -> int:  # callbacks count calls, one for a step of all environments
+        return max(freq // hyperparams.n_envs, 1)
+
+    if experiment.save_freq > 0:
+        callbacks.append(
+            CheckpointCallback(
+                calls(experiment.save_freq),
+                str(folder.path),
+                save_replay_buffer=experiment.save_replay_buffer,
+                save_vecnormalize=True,
+            )
+        )
+    if eval_env is not None:
+        callbacks.append(
+            EvalCallback(
+                eval_env,
+                callback_on_new_best=_SaveNormalization(folder.normalization(folder.best_model)),
+                callback_after_eval=progress.evaluation,
+                n_eval_episodes=experiment.eval_episodes,
+                eval_freq=calls(experiment.eval_freq),
+                log_path=str(folder.path),
+                best_model_save_path=str(folder.path),
+                deterministic=True,
+                verbose=0,
+            )
+        )
+    return callbacks
+
+
+def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
+    folder = experiment.folder
+    save_model(model, folder.model)
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        normalization.save(str(folder.normalization(folder.model)))
+    if experiment.save_replay_buffer:
+        model.save_replay_buffer(folder.replay_buffer)
+
+
+def _close(env: VecEnv | None) -> None:
+    try:
+        if env is not None:
+            env.close()
+    except (BrokenPipeError, ConnectionResetError, EOFError):
+        pass  # Ctrl-C has reached the processes of the environments before
+
+
+class _SaveNormalization(BaseCallback):
+    """Save the statistics of ``VecNormalize`` beside a new best model."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.path = path
+
+    def _on_step(self) -> bool:
+        normalization = unwrap_vec_normalize(self.training_env)
+        if normalization is not None:
+            normalization.save(str(self.path))
+        return True
+
+
+class _HParamsCallback(BaseCallback):
+    """Write the hyperparameters to TensorBoard's HParams tab."""
+
+    def __init__(self, experiment: Experiment):
+        super().__init__()
+        flat = {"algo": experiment.algo, "env": experiment.env_id, "seed": experiment.seed}
+        for key, value in experiment.hyperparams.raw.items():
+            flat[key] = value if isinstance(value, (bool, int, float, str)) else str(value)
+        self.hparams = flat
+
+    def _on_training_start(self) -> None:
+        metrics: dict[str, float] = {"eval/mean_reward": 0.0, "rollout/ep_rew_mean": 0.0}
+        self.logger.record("hparams", HParam(self.hparams, metrics), exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return True

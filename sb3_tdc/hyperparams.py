@@ -1,0 +1,291 @@
+"""
+YAML files → validated keyword arguments of an algorithm. Keys are RL Zoo's; nothing is ever evaluated.
+
+Knows neither the command line nor environments.
+"""
+
+import collections.abc
+import difflib
+import importlib
+import inspect
+import types
+import typing
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
+
+# What an entry may say besides the keyword arguments of the algorithm, with its type
+_RUN_KEYS: dict[str, Any] = {
+    "n_timesteps": int,
+    "n_envs": int,
+    "normalize": bool | dict,
+    "frame_stack": int | None,
+    "env_wrapper": str | dict | list | None,
+    "vec_env_wrapper": str | dict | list | None,
+    "callback": str | dict | list | None,
+    "env_kwargs": dict[str, Any],
+    "monitor_kwargs": dict[str, Any],
+    "noise_type": str | None,
+    "noise_std": float,
+}
+# Keyword arguments that belong to one run, not to an environment: train.py has flags for them
+_FLAGS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+# Where a class may be named without its module
+_CLASS_MODULES = ("torch.nn", "torch.optim", "stable_baselines3", "stable_baselines3.common.buffers")
+_NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
+
+
+@dataclass
+class Hyperparams:
+    """
+    One validated entry.
+
+    :param raw: the entry as written, for ``config.yml``
+    :param model: keyword arguments of the algorithm's constructor
+    :param n_timesteps: environment steps to train for
+    :param normalize: keyword arguments of ``VecNormalize``, or None for none
+    :param env_wrapper: callables that take and return an environment
+    :param vec_env_wrapper: the same for a vectorised environment
+    :param callbacks: factories of callbacks
+    :param noise_std: standard deviation of the action noise of ``noise_type``, in normalised action units
+    """
+
+    raw: dict[str, Any]
+    model: dict[str, Any]
+    n_timesteps: int
+    n_envs: int = 1
+    normalize: dict[str, Any] | None = None
+    frame_stack: int | None = None
+    env_wrapper: list[Callable] = field(default_factory=list)
+    vec_env_wrapper: list[Callable] = field(default_factory=list)
+    callbacks: list[Callable] = field(default_factory=list)
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
+    noise_type: str | None = None
+    noise_std: float = 0.0
+
+
+def hyperparams_file(algo: str) -> Path:
+    """:return: the file of an algorithm that comes with this package"""
+    package = Path(__file__).parent
+    installed, checkout = package / "_hyperparams", package.parent / "hyperparams"
+    return (installed if installed.is_dir() else checkout) / f"{algo}.yml"
+
+
+def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], bool]:
+    """
+    The entry of an environment, with the file's ``default`` merged under it.
+
+    :return: the entry and whether the environment has one of its own
+    :raises ValueError: if the file cannot be read, or has neither an entry nor a default
+    """
+    try:
+        entries = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(entries, dict) or not all(isinstance(e, dict) for e in entries.values()):
+        raise ValueError(f"{path} must map environment ids to hyperparameters")
+    if env_id not in entries and "default" not in entries:
+        raise ValueError(f"{path} has no entry for {env_id} and no default{suggest(env_id, entries)}")
+    return {**entries.get("default", {}), **entries.get(env_id, {})}, env_id in entries
+
+
+def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> Hyperparams:
+    """
+    Check every key and value of an entry against the algorithm's constructor.
+
+    :param entry: as read from the file
+    :param algorithm: its constructor's annotations are the schema
+    :param where: the file and the environment, for the error
+    :raises ValueError: naming the key, what it was, what is allowed, and the nearest known key
+    """
+    hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _FLAGS}
+    hints.update(_RUN_KEYS)
+    values = _convert_mapping(entry, hints, where)
+    if "n_timesteps" not in values:
+        raise ValueError(f"{where}: n_timesteps is missing")
+    for key in ("n_timesteps", "n_envs", "frame_stack"):
+        if values.get(key) is not None and values[key] < 1:
+            raise ValueError(f"{where}: {key} must be at least 1, got {values[key]}")
+    if values.get("noise_type") not in (None, *_NOISE_TYPES):
+        raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {values['noise_type']!r}")
+    _convert_policy(values, algorithm, where)
+
+    run = {key: values.pop(key) for key in _RUN_KEYS if key in values}
+    normalize = run.pop("normalize", False)
+    if normalize is not False:
+        options = normalize if isinstance(normalize, dict) else {}
+        normalize = {"gamma": values.get("gamma", 0.99), **options}
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        run[key] = _factories(run.get(key), f"{where}: {key}")
+    return Hyperparams(
+        raw=dict(entry),
+        model=values,
+        normalize=normalize or None,
+        callbacks=_factories(run.pop("callback", None), f"{where}: callback"),
+        **run,
+    )
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """:return: ", did you mean ...?", or nothing if no known name is near"""
+    by_lower = {k.lower(): k for k in known}
+    nearest = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
+    return f"; did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
+
+
+def constructor_hints(cls: type) -> dict[str, Any]:
+    """:return: the annotation of every argument of a constructor, those it passes on by ``**kwargs`` included"""
+    hints: dict[str, Any] = {}
+    for base in cls.__mro__:
+        if "__init__" in vars(base):
+            parameters = inspect.signature(base.__init__).parameters
+            named = {k: p for k, p in parameters.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+            # An annotation that is missing, or a text, allows anything
+            typed = {k: Any if isinstance(p.annotation, str) else p.annotation for k, p in named.items()}
+            hints = {**{k: Any if hint is inspect.Parameter.empty else hint for k, hint in typed.items()}, **hints}
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+                break
+    return hints
+
+
+def _convert_mapping(mapping: dict[str, Any], hints: dict[str, Any], where: str) -> dict[str, Any]:
+    converted = {}
+    for key, value in mapping.items():
+        if key not in hints:
+            raise ValueError(f"{where}: unknown key {key!r}{suggest(str(key), hints)}")
+        try:
+            converted[key] = _convert(value, hints[key])
+        except (TypeError, ValueError) as error:
+            detail = f" ({error})" if str(error) else ""
+            raise ValueError(f"{where}: {key} must be {_describe(hints[key])}, got {value!r}{detail}") from error
+    return converted
+
+
+def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> None:
+    """Resolve the policy, and check ``policy_kwargs`` against its constructor."""
+    policy = values.setdefault("policy", "MlpPolicy")
+    if isinstance(policy, str) and "." in policy:
+        policy = values["policy"] = _import_class(policy)
+    if isinstance(policy, str):
+        if policy not in algorithm.policy_aliases:
+            raise ValueError(f"{where}: unknown policy {policy!r}{suggest(policy, algorithm.policy_aliases)}")
+        policy = algorithm.policy_aliases[policy]
+    if values.get("policy_kwargs"):
+        hints = constructor_hints(policy)
+        hints = {k: h for k, h in hints.items() if k not in {"self", "observation_space", "action_space", "lr_schedule"}}
+        values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, f"{where}: policy_kwargs")
+
+
+def _convert(value: Any, hint: Any) -> Any:
+    """:return: the value as the annotation wants it; :raises TypeError, ValueError: if it cannot be"""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(value, args)
+    if hint is float:
+        return float(_number(value))
+    if hint is int:
+        number = _number(value)
+        if number != int(number):
+            raise TypeError
+        return int(number)
+    if origin is collections.abc.Callable:
+        return _schedule(value)
+    if origin is type or hint is type:
+        return _import_class(value, args[0] if args else object)
+    if origin is tuple and isinstance(value, list) and len(value) == len(args):
+        return tuple(_convert(v, a) for v, a in zip(value, args, strict=True))
+    if origin is list and isinstance(value, list):
+        return [_convert(v, args[0]) for v in value]
+    if origin is dict and isinstance(value, dict):
+        return {k: _convert(v, args[1]) for k, v in value.items()}
+    if hint is type(None) and value is None:
+        return None
+    if isinstance(hint, type) and hint is not bool and isinstance(value, hint):
+        return value
+    if hint is bool and isinstance(value, bool):
+        return value
+    raise TypeError
+
+
+def _convert_union(value: Any, members: tuple[Any, ...]) -> Any:
+    reasons = []
+    for member in members:
+        try:
+            return _convert(value, member)
+        except (TypeError, ValueError) as error:
+            reasons += [str(error)] if str(error) else []
+    raise TypeError("; ".join(reasons))
+
+
+def _number(value: Any) -> float:
+    """Numbers, and the texts that YAML makes of 3e-4 and 1e6."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise TypeError
+    try:
+        return value if not isinstance(value, str) else float(value)
+    except ValueError:
+        raise TypeError from None
+
+
+def _schedule(value: Any) -> Callable[[float], float]:
+    if not isinstance(value, str) or not value.startswith("lin_"):
+        raise TypeError
+    return LinearSchedule(_number(value.removeprefix("lin_")), 0.0, 1.0)
+
+
+def _import_class(name: Any, base: Any = object) -> type:
+    if not isinstance(name, str):
+        raise TypeError
+    modules, _, attribute = name.rpartition(".")
+    if modules == "nn":
+        modules = "torch.nn"
+    for module in [modules] if modules else _CLASS_MODULES:
+        try:
+            found = getattr(importlib.import_module(module), attribute, None)
+        except ModuleNotFoundError as error:
+            raise ValueError(f"there is no module {error.name!r}") from error
+        if isinstance(found, type) and (not isinstance(base, type) or issubclass(found, base)):
+            return found
+    raise ValueError(f"{name!r} names no {getattr(base, '__name__', base)} class")
+
+
+def _factories(entries: Any, where: str) -> list[Callable]:
+    """``module.Class``, ``{module.Class: {keyword: value}}``, or a list of these."""
+    factories = []
+    for entry in [] if entries is None else entries if isinstance(entries, list) else [entries]:
+        name, kwargs = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else (entry, {})
+        try:
+            cls = _import_class(name)
+        except (TypeError, ValueError) as error:
+            detail = f": {error}" if str(error) else ""
+            raise ValueError(f"{where} must name a class, or map it to its keyword arguments{detail}") from error
+        factories.append(lambda *args, cls=cls, kwargs=kwargs or {}: cls(*args, **kwargs))
+    return factories
+
+
+def _describe(hint: Any) -> str:
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(dict.fromkeys(_describe(member) for member in args))
+    if origin is collections.abc.Callable:
+        return 'a schedule ("lin_" and a number)'
+    if origin is type:
+        return f"the name of a {args[0].__name__} class"
+    if origin in (tuple, list):
+        return f"a list of {', '.join(_describe(a) for a in args)}"
+    simple = {float: "a number", int: "an integer", bool: "true or false", str: "a text", type(None): "null"}
+    simple.update({dict: "a mapping", list: "a list", th.device: "a device"})
+    if origin is dict or hint in simple:
+        return simple[origin or hint]
+    return f"a {getattr(hint, '__name__', hint)}"

@@ -1,0 +1,134 @@
+"""Where a run keeps its files: RL Zoo's layout, ``logs/tdc/Walker2d-v4_1/…``."""
+
+import os
+import re
+import shlex
+import sys
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """
+    The files of one run.
+
+    :param path: ``<log folder>/<algo>/<environment>_<number>``
+    :param env_name: the environment's id, without slashes
+    """
+
+    path: Path
+    env_name: str
+
+    @classmethod
+    def create(cls, log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> "RunFolder":
+        """
+        Make the next free folder; two runs that start at once get one each.
+
+        :param unique: append a UUID to the name
+        """
+        env_name, parent = _env_name(env_id), Path(log_folder) / algo
+        parent.mkdir(parents=True, exist_ok=True)
+        number = max(_numbered(parent, env_name), default=0) + 1
+        while True:
+            path = parent / f"{env_name}_{number}{f'_{uuid.uuid4()}' if unique else ''}"
+            try:
+                path.mkdir()
+            except FileExistsError:
+                number += 1
+                continue
+            (path / env_name).mkdir()
+            return cls(path, env_name)
+
+    @classmethod
+    def find(cls, log_folder: str | Path, algo: str, env_id: str, number: int = 0) -> "RunFolder":
+        """
+        :param number: of the run; 0 is the latest
+        :raises ValueError: if there is none
+        """
+        env_name, parent = _env_name(env_id), Path(log_folder) / algo
+        runs = _numbered(parent, env_name)
+        if not runs or (number and number not in runs):
+            known = f"; there are {', '.join(map(str, sorted(runs)))}" if runs else ""
+            wanted = f"run {number} of" if number else "run of"
+            raise ValueError(f"There is no {wanted} {algo} on {env_id} in {parent}{known}")
+        return cls(runs[number or max(runs)], env_name)
+
+    @classmethod
+    def open(cls, path: str | Path) -> "RunFolder":
+        """:raises ValueError: if the folder is not one of a run"""
+        path = Path(path)
+        configs = list(path.glob("*/config.yml"))
+        if len(configs) != 1:
+            raise ValueError(f"{path} is not the folder of a run: it has no <environment>/config.yml")
+        return cls(path, configs[0].parent.name)
+
+    @property
+    def model(self) -> Path:
+        return self.path / f"{self.env_name}.zip"
+
+    @property
+    def best_model(self) -> Path:
+        return self.path / "best_model.zip"
+
+    @property
+    def replay_buffer(self) -> Path:
+        return self.path / "replay_buffer.pkl"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The hyperparameters as they were read."""
+        return yaml.safe_load((self.path / self.env_name / "config.yml").read_text())
+
+    @property
+    def args(self) -> dict[str, Any]:
+        """The command line arguments."""
+        return yaml.safe_load((self.path / self.env_name / "args.yml").read_text())
+
+    def checkpoints(self) -> dict[int, Path]:
+        """:return: the model of every checkpoint, by timestep, oldest first"""
+        found = {}
+        for path in self.path.glob("rl_model_*_steps.zip"):
+            if match := re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name):
+                found[int(match[1])] = path
+        return dict(sorted(found.items()))
+
+    def normalization(self, model: Path) -> Path:
+        """:return: where the ``VecNormalize`` statistics of one of the run's models are"""
+        if model == self.best_model:
+            return self.path / "best_model_vecnormalize.pkl"
+        if match := re.fullmatch(r"rl_model_(\d+)_steps\.zip", model.name):
+            return self.path / f"rl_model_vecnormalize_{match[1]}_steps.pkl"
+        return self.path / self.env_name / "vecnormalize.pkl"
+
+    def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
+        """Keep what the run was made from: hyperparameters, arguments, and the command."""
+        folder = self.path / self.env_name
+        (folder / "config.yml").write_text(yaml.safe_dump(config))
+        (folder / "args.yml").write_text(yaml.safe_dump(args))
+        (folder / "command.txt").write_text(shlex.join(sys.orig_argv) + "\n")
+
+
+def save_model(model: BaseAlgorithm, path: Path) -> None:
+    """Save beside, then rename: a file that is already there stays whole until the new one is."""
+    beside = path.with_name(f".{path.stem}.part.zip")
+    model.save(beside)
+    os.replace(beside, path)
+
+
+def _env_name(env_id: str) -> str:
+    return env_id.replace("/", "-").replace(":", "-")
+
+
+def _numbered(parent: Path, env_name: str) -> dict[int, Path]:
+    """The runs of an environment, by number; of several with one number (by UUID), the last one made."""
+    runs = {}
+    for path in sorted(parent.glob(f"{env_name}_*"), key=lambda p: p.stat().st_mtime):
+        if path.is_dir() and (match := re.fullmatch(r"_(\d+)(_[0-9a-f-]{36})?", path.name[len(env_name) :])):
+            runs[int(match[1])] = path
+    return runs

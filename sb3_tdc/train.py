@@ -1,0 +1,162 @@
+"""``python train.py --algo tdc --env Walker2d-v4``: arguments and messages; the run itself is in ``experiment``."""
+
+import argparse
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import yaml
+from gymnasium.error import DependencyNotInstalled
+from stable_baselines3.common.utils import set_random_seed
+
+from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments
+from sb3_tdc.experiment import ALGORITHMS, Experiment, check_env_id, train
+from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
+from sb3_tdc.run_folder import RunFolder
+from sb3_tdc.tdc import NonFiniteError
+
+
+def make_parser() -> Parser:
+    """:return: RL Zoo's flags, names and meanings"""
+    parser = Parser("Train an agent. Hyperparameters come from hyperparams/<algo>.yml, as in RL Zoo.")
+    add_common_arguments(parser, ALGORITHMS)
+    add = parser.add_argument
+    add("--env", default="HalfCheetah-v4", help="environment id")
+    add("-n", "--n-timesteps", type=int, default=-1, help="environment steps (-1: as in the hyperparameters)")
+    add("--seed", type=int, default=-1, help="seed of all generators (-1: a random one)")
+    add("-i", "--trained-agent", type=Path, help="zip of a model to go on from")
+    add("--eval-freq", type=int, default=20_000, help="evaluate every so many steps (-1: never)")
+    add("--eval-episodes", type=int, default=5, help="episodes per evaluation")
+    add("--n-eval-envs", type=int, default=1, help="environments for evaluation")
+    add("--save-freq", type=int, default=-1, help="save the model every so many steps (-1: only at the end)")
+    add("--save-replay-buffer", action="store_true", help="save the replay buffer with the model")
+    add("--log-interval", type=int, default=-1, help="episodes between log entries (-1: 4, -2: no log)")
+    add("-tb", "--tensorboard-log", help='TensorBoard folder (none given: the run\'s own; "": off)')
+    add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="environments in this process or in their own")
+    add("--eval-env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the evaluation environment")
+    add("-params", "--hyperparams", nargs="+", action=KeyValues, default={}, help="key:value over the hyperparameters")
+    add("-conf", "--conf-file", type=Path, help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
+    add("-uuid", "--uuid", action="store_true", help="a unique name for the run folder")
+    bar = parser.add_mutually_exclusive_group()
+    bar.add_argument("-P", "--progress", action="store_true", default=None, help="a progress bar (on a terminal: default)")
+    bar.add_argument("--no-progress", dest="progress", action="store_false", help="plain lines, also on a terminal")
+    add("--verbose", type=int, default=1, help="0: silent, 1: progress, 2: also SB3's tables and messages")
+    return parser
+
+
+def read_hyperparams(args: argparse.Namespace) -> Hyperparams:
+    """The entry of the environment, overruled by ``-params`` and ``-n``, validated; said on screen."""
+    path = args.conf_file or hyperparams_file(args.algo)
+    entry, has_entry = read_entry(path, args.env)
+    overrides = {**args.hyperparams, **({"n_timesteps": args.n_timesteps} if args.n_timesteps > 0 else {})}
+    algorithm = ALGORITHMS[args.algo]
+    where = f"{path}, {args.env if has_entry else 'default'}"
+    parse({"n_timesteps": 1, **entry}, algorithm, where)  # so that an error names its source
+    parse({"n_timesteps": 1, **overrides}, algorithm, "command line (-params)")
+    hyperparams = parse({**entry, **overrides}, algorithm, where)
+    if args.verbose > 0:
+        print(f"Hyperparameters: {where}{'' if has_entry else f' (it has no entry for {args.env})'}")
+        print("  " + yaml.safe_dump(hyperparams.raw, sort_keys=False, default_flow_style=None).strip().replace("\n", "\n  "))
+    return hyperparams
+
+
+def make_experiment(args: argparse.Namespace) -> Experiment:
+    """
+    Check everything that can be checked, then make the run folder.
+
+    :raises ValueError: for anything that is not allowed
+    """
+    apply_common_arguments(args)
+    check_env_id(args.env)
+    for name in ("eval_episodes", "n_eval_envs"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(args, name)}")
+    if args.trained_agent is not None and not (args.trained_agent.suffix == ".zip" and args.trained_agent.is_file()):
+        raise ValueError(f"-i must be the zip of a model, got {args.trained_agent}")
+    progress_bar = args.progress
+    if progress_bar is None:
+        progress_bar = sys.stderr.isatty() and _has_tqdm(args.verbose)
+    if args.seed < 0:
+        args.seed = int(np.random.randint(2**31 - 1))
+    hyperparams = read_hyperparams(args)
+    set_random_seed(args.seed)
+
+    folder = RunFolder.create(args.log_folder, args.algo, args.env, args.uuid)
+    arguments = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+    folder.write_config(hyperparams.raw, arguments)
+    return Experiment(
+        algo=args.algo,
+        env_id=args.env,
+        hyperparams=hyperparams,
+        folder=folder,
+        seed=args.seed,
+        eval_freq=args.eval_freq,
+        eval_episodes=args.eval_episodes,
+        n_eval_envs=args.n_eval_envs,
+        save_freq=args.save_freq,
+        save_replay_buffer=args.save_replay_buffer,
+        vec_env=args.vec_env,
+        device=args.device,
+        env_kwargs=args.env_kwargs,
+        eval_env_kwargs=args.eval_env_kwargs,
+        tensorboard_log=args.tensorboard_log,
+        trained_model=args.trained_agent,
+        log_interval={-1: 4, -2: None}.get(args.log_interval, args.log_interval),
+        progress_bar=progress_bar,
+        verbose=args.verbose,
+    )
+
+
+def _has_tqdm(verbose: int) -> bool:
+    try:
+        import tqdm  # noqa: F401
+    except ImportError:
+        if verbose > 0:
+            print('For a progress bar: pip install "sb3-tdc[progress]"')
+        return False
+    return True
+
+
+def _terminate(*_: Any) -> NoReturn:
+    raise KeyboardInterrupt  # a polite kill is a Ctrl-C
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    :param argv: arguments, those of the process by default
+    :return: 0, 1 if training diverged, 130 if the user stopped it
+    """
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    signal.signal(signal.SIGTERM, _terminate)
+    start = time.monotonic()
+    try:
+        experiment = make_experiment(args)
+        folder = experiment.folder
+        if args.verbose > 0:
+            print(f"Training {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
+        outcome = train(experiment)
+    except NonFiniteError as error:
+        print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)
+        return 1
+    except (ValueError, AssertionError, ImportError, DependencyNotInstalled) as error:
+        parser.fail(error)
+    if args.verbose > 0:
+        print(f"Saved {folder.model} after {timedelta(seconds=round(time.monotonic() - start))}")
+    if outcome.interrupted:
+        steps, total = outcome.model.num_timesteps, experiment.hyperparams.n_timesteps
+        print(f"Stopped at step {steps:,} of {total:,}. To go on from there with a new run:")
+        print(f"  python train.py --algo {args.algo} --env {args.env} -n {total - steps} -i {folder.model}")
+        return 130
+    if args.verbose > 0:
+        print(f"To watch it: python enjoy.py {folder.path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

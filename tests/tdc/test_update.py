@@ -1,0 +1,203 @@
+"""The update against an independent transcription of Algorithm 1, and what it may and may not move."""
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_tdc import TDC
+from tests.tdc.reference import Reference
+
+OBS, ACT, BATCH = 3, 2, 5
+
+
+class TwoActions(gym.Env):
+    """Observations in R³, two actions in [-0.4, 2]: unequal bounds, so that scaling mistakes show."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (OBS,), np.float32)
+    action_space = gym.spaces.Box(-0.4, 2.0, (ACT,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        self.episode = getattr(self, "episode", -1) + 1
+        return self.np_random.normal(size=OBS).astype(np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.t += 1
+        reward = -float(np.square(action).sum())
+        timeout, terminal = (self.t == 5, False) if self.episode % 2 == 0 else (False, self.t == 7)
+        return self.np_random.normal(size=OBS).astype(np.float32), reward, terminal, timeout, {}
+
+
+def make_model(**kwargs):
+    policy_kwargs = {"net_arch": [32, 24], "n_quantiles": 4, **kwargs.pop("policy_kwargs", {})}
+    return TDC("MlpPolicy", TwoActions(), policy_kwargs=policy_kwargs, seed=3, buffer_size=500, device="cpu", **kwargs)
+
+
+def random_batches(n, seed=0, batch=BATCH):
+    rng = np.random.default_rng(seed)
+    for _ in range(n):
+        yield [
+            th.tensor(x, dtype=th.float32)
+            for x in (
+                rng.normal(size=(batch, OBS)),
+                rng.uniform(-1, 1, (batch, ACT)),
+                rng.normal(size=(batch, OBS)),
+                (rng.random((batch, 1)) < 0.3).astype(float),
+                rng.normal(size=(batch, 1)) * 3,
+            )
+        ]
+
+
+class BatchQueue:
+    """Stands in for the replay buffer: gives the batches of the test, in order."""
+
+    def __init__(self, batches):
+        self.batches = iter(batches)
+
+    def sample(self, batch_size, env=None):
+        return ReplayBufferSamples(*next(self.batches))
+
+
+def double(module):
+    return (module.weight.detach().double().clone(), module.bias.detach().double().clone())
+
+
+def reference_of(model, **kwargs):
+    actor = model.actor
+    if model.stochastic_actor:
+        latent = [double(m) for m in actor.latent_pi if isinstance(m, th.nn.Linear)]
+        networks = {"latent": latent, "mu": double(actor.mu), "log_std": double(actor.log_std)}
+    else:
+        networks = {"mu": [double(m) for m in actor.mu if isinstance(m, th.nn.Linear)]}
+    stacked = [layer for layer in model.critic.layers if hasattr(layer, "weight")]
+    critics = [
+        [(la.weight[i].detach().double().T.clone(), la.bias[i, 0].detach().double().clone()) for la in stacked]
+        for i in range(model.critic.n_critics)
+    ]
+    return Reference(networks, critics, stochastic=model.stochastic_actor, **kwargs)
+
+
+def actor_weights(actor):
+    return [p.detach().double() for p in actor.parameters()]
+
+
+def critic_weights(critic):
+    """(out, in) weights and biases, critic by critic, as the reference keeps them."""
+    stacked = [layer for layer in critic.layers if hasattr(layer, "weight")]
+    return [
+        t.detach().double()
+        for i in range(critic.n_critics)
+        for layer in stacked
+        for t in (layer.weight[i].T, layer.bias[i, 0])
+    ]
+
+
+def reference_actor_weights(networks):
+    parts = [networks[k] for k in ("latent", "mu", "log_std") if k in networks]
+    return [t.detach() for part in parts for pair in (part if isinstance(part, list) else [part]) for t in pair]
+
+
+@pytest.mark.parametrize("stochastic", [False, True], ids=["deterministic", "stochastic"])
+@pytest.mark.parametrize(
+    ("n_critics", "lam", "kappa"), [(2, 0.9, 1.0), (2, 0.0, 0.0), (1, 1.0, 0.3), (3, 0.5, 10.0)]
+)
+def test_updates_equal_algorithm_1(monkeypatch, stochastic, n_critics, lam, kappa):
+    """Five updates (two of them delayed): every weight, every target weight, and the temperature."""
+    settings = dict(lam=lam, kappa=kappa, gamma=0.97, tau=0.05)
+    model = make_model(
+        stochastic_actor=stochastic,
+        learning_rate=1e-2,
+        qf_learning_rate=2e-2,
+        policy_delay=2,
+        target_policy_noise=0.5,
+        target_noise_clip=0.3,
+        policy_kwargs={"n_critics": n_critics},
+        **settings,
+    )
+    reference = reference_of(model, delay=2, noise_std=0.5, noise_clip=0.3, lr=1e-2, qf_lr=2e-2, **settings)
+    batches = list(random_batches(5))
+    model.replay_buffer = BatchQueue(batches)
+
+    # Noise by hand: the same standard normal numbers for both, in the order in which they are drawn
+    noises = []
+
+    def draw(shape):
+        noise = th.randn(shape, generator=th.Generator().manual_seed(100 + len(noises)))
+        noises.append(noise.double())
+        return noise
+
+    monkeypatch.setattr(th, "randn_like", lambda tensor: draw(tensor.shape))
+    monkeypatch.setattr(
+        th.distributions.Normal, "rsample", lambda self, shape=(): self.loc + self.scale * draw(self.loc.shape)
+    )
+    for update, batch in enumerate(batches, start=1):
+        noises.clear()
+        model.train(gradient_steps=1, batch_size=BATCH)
+        states, actions, next_states, dones, rewards = (t.double() for t in batch)
+        transitions = list(zip(states, actions, rewards[:, 0].tolist(), next_states, dones[:, 0].tolist(), strict=True))
+        assert len(noises) == (2 if stochastic and update % 2 == 0 else 1)
+        reference.update(transitions, noises[0], noises[-1])
+
+    def check(actual, expected):
+        assert len(actual) == len(expected)
+        for a, e in zip(actual, expected, strict=True):
+            th.testing.assert_close(a, e, rtol=1e-4, atol=2e-6)
+
+    check(critic_weights(model.critic), [t.detach() for c in reference.critics for pair in c for t in pair])
+    check(critic_weights(model.critic_target), [t.detach() for c in reference.target_critics for p in c for t in p])
+    check(actor_weights(model.actor), reference_actor_weights(reference.actor))
+    check(actor_weights(model.actor_target), reference_actor_weights(reference.target_actor))
+    if stochastic:
+        check([model.log_ent_coef.detach().double()], [reference.log_alpha.detach()])
+
+
+def snapshot(model):
+    state = copy.deepcopy({k: v.clone() for k, v in model.policy.state_dict().items()})
+    if model.stochastic_actor:
+        state["log_ent_coef"] = model.log_ent_coef.detach().clone()
+    return state
+
+
+@pytest.mark.parametrize("stochastic", [False, True], ids=["deterministic", "stochastic"])
+def test_delay_moves_actor_and_targets_only_every_third_update(stochastic):
+    model = make_model(stochastic_actor=stochastic, policy_delay=3)
+    model.replay_buffer = BatchQueue(random_batches(6))
+    for update in range(1, 7):
+        before = snapshot(model)
+        model.train(gradient_steps=1, batch_size=BATCH)
+        after = snapshot(model)
+        moved = {name.split(".")[0] for name in before if not th.equal(before[name], after[name])}
+        delayed = {"actor", "actor_target", "critic_target"} | ({"log_ent_coef"} if stochastic else set())
+        assert moved == {"critic"} | (delayed if update % 3 == 0 else set())
+
+
+def test_actor_step_leaves_no_gradient_in_the_critics():
+    model = make_model(policy_delay=1)
+    model.replay_buffer = BatchQueue(random_batches(2))
+    gradients = []
+    step = model.actor.optimizer.step
+    model.actor.optimizer.step = lambda *a, **k: (gradients.extend(_gradients(model.critic)), step(*a, **k))
+    model.critic.optimizer.step = lambda *a, **k: gradients.extend(_gradients(model.critic))
+    model.train(gradient_steps=1, batch_size=BATCH)
+    half = len(gradients) // 2
+    assert all(th.equal(a, b) for a, b in zip(gradients[:half], gradients[half:], strict=True))
+
+
+def _gradients(module):
+    return [p.grad.clone() for p in module.parameters()]
+
+
+def test_only_terminations_cut_the_bootstrap():
+    """Episodes end in turn by a time-out at step 5 and by termination at step 7: the target sees only the latter."""
+    model = make_model(learning_starts=0, gradient_steps=0)
+    model.learn(36)
+    ends = [t % 12 in (5, 0) for t in range(1, 37)]
+    terminations = [float(t % 12 == 0) for t in range(1, 37)]
+    assert model.replay_buffer.dones[:36, 0].tolist() == [float(e) for e in ends]
+    assert model.replay_buffer._get_samples(np.arange(36)).dones[:, 0].tolist() == terminations
