@@ -56,7 +56,9 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
 
     def check(name: str) -> str:
         if name not in known:
-            raise argparse.ArgumentTypeError(f"unknown {kind} {name!r}{suggest(name, known)}; known: {', '.join(known)}")
+            raise argparse.ArgumentTypeError(
+                f"unknown {kind} {name!r}{suggest(name, known)}; known: {', '.join(known)}"
+            )
         return name
 
     return check
@@ -65,7 +67,7 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
 def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:
     """The flags that training and enjoying share, as in RL Zoo."""
     parser.add_argument("--algo", type=one_of("algorithm", algorithms), default="tdc", help="algorithm")
-    parser.add_argument("-f", "--log-folder", default="logs", help="folder of all runs")
+    parser.add_argument("-f", "--log-folder", "--folder", default="logs", help="folder of all runs")
     parser.add_argument("--num-threads", type=int, default=-1, help="threads for PyTorch (-1: PyTorch's default)")
     parser.add_argument("--device", default="auto", help="PyTorch device (cpu, cuda, ...)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
@@ -82,6 +84,8 @@ def apply_common_arguments(args: argparse.Namespace) -> None:
         try:
             importlib.import_module(package)
         except ModuleNotFoundError as error:
-            raise ValueError(f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}") from error
+            raise ValueError(
+                f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}"
+            ) from error
     if args.num_threads > 0:
         th.set_num_threads(args.num_threads)

@@ -129,7 +129,7 @@ def make_envs(
         monitor_kwargs=hyperparams.monitor_kwargs,
         wrapper_class=wrap,
         env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
-        vec_env_cls={"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[vec_env],
+        vec_env_cls=SubprocVecEnv if vec_env == "subproc" else DummyVecEnv,
     )
     for wrapper in hyperparams.vec_env_wrapper:
         env = wrapper(env)
@@ -249,9 +249,7 @@ def _make_logger(experiment: Experiment) -> Logger:
     return Logger(str(folder), writers)
 
 
-def _make_callbacks(
-    experiment: Experiment, eval_env: VecEnv | None, progress: ProgressCallback
-) -> list[BaseCallback]:
+def _make_callbacks(experiment: Experiment, eval_env: VecEnv | None, progress: ProgressCallback) -> list[BaseCallback]:
     hyperparams, folder = experiment.hyperparams, experiment.folder
     callbacks = [*(make() for make in hyperparams.callbacks), _HParamsCallback(experiment)]
 
@@ -321,7 +319,11 @@ class _HParamsCallback(BaseCallback):
 
     def __init__(self, experiment: Experiment):
         super().__init__()
-        flat = {"algo": experiment.algo, "env": experiment.env_id, "seed": experiment.seed}
+        flat: dict[str, bool | str | float | None] = {
+            "algo": experiment.algo,
+            "env": experiment.env_id,
+            "seed": experiment.seed,
+        }
         for key, value in experiment.hyperparams.raw.items():
             flat[key] = value if isinstance(value, (bool, int, float, str)) else str(value)
         self.hparams = flat

@@ -36,6 +36,8 @@ _RUN_KEYS: dict[str, Any] = {
 }
 # Keyword arguments that belong to one run, not to an environment: train.py has flags for them
 _FLAGS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+# What the algorithm itself passes to the policy
+_POLICY_ARGUMENTS = {"self", "observation_space", "action_space", "lr_schedule"}
 # Where a class may be named without its module
 _CLASS_MODULES = ("torch.nn", "torch.optim", "stable_baselines3", "stable_baselines3.common.buffers")
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
@@ -147,7 +149,7 @@ def constructor_hints(cls: type) -> dict[str, Any]:
     hints: dict[str, Any] = {}
     for base in cls.__mro__:
         if "__init__" in vars(base):
-            parameters = inspect.signature(base.__init__).parameters
+            parameters = inspect.signature(vars(base)["__init__"]).parameters
             named = {k: p for k, p in parameters.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
             # An annotation that is missing, or a text, allows anything
             typed = {k: Any if isinstance(p.annotation, str) else p.annotation for k, p in named.items()}
@@ -180,8 +182,7 @@ def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], wher
             raise ValueError(f"{where}: unknown policy {policy!r}{suggest(policy, algorithm.policy_aliases)}")
         policy = algorithm.policy_aliases[policy]
     if values.get("policy_kwargs"):
-        hints = constructor_hints(policy)
-        hints = {k: h for k, h in hints.items() if k not in {"self", "observation_space", "action_space", "lr_schedule"}}
+        hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in _POLICY_ARGUMENTS}
         values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, f"{where}: policy_kwargs")
 
 

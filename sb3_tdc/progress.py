@@ -103,4 +103,3 @@ def _import_tqdm() -> Any:
     except ImportError as error:
         raise ImportError('A progress bar needs tqdm: pip install "sb3-tdc[progress]"') from error
     return tqdm
-

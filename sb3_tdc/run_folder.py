@@ -12,6 +12,8 @@ from typing import Any
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_tdc.hyperparams import suggest
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -54,7 +56,7 @@ class RunFolder:
         env_name, parent = _env_name(env_id), Path(log_folder) / algo
         runs = _numbered(parent, env_name)
         if not runs or (number and number not in runs):
-            known = f"; there are {', '.join(map(str, sorted(runs)))}" if runs else ""
+            known = f"; there are {', '.join(map(str, sorted(runs)))}" if runs else suggest(env_id, _env_names(parent))
             wanted = f"run {number} of" if number else "run of"
             raise ValueError(f"There is no {wanted} {algo} on {env_id} in {parent}{known}")
         return cls(runs[number or max(runs)], env_name)
@@ -123,6 +125,10 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
 
 def _env_name(env_id: str) -> str:
     return env_id.replace("/", "-").replace(":", "-")
+
+
+def _env_names(parent: Path) -> set[str]:
+    return {config.parent.name for config in parent.glob("*/*/config.yml")}
 
 
 def _numbered(parent: Path, env_name: str) -> dict[int, Path]:

@@ -3,6 +3,7 @@
 import argparse
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from datetime import timedelta
@@ -43,7 +44,9 @@ def make_parser() -> Parser:
     add("-conf", "--conf-file", type=Path, help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
     add("-uuid", "--uuid", action="store_true", help="a unique name for the run folder")
     bar = parser.add_mutually_exclusive_group()
-    bar.add_argument("-P", "--progress", action="store_true", default=None, help="a progress bar (on a terminal: default)")
+    bar.add_argument(
+        "-P", "--progress", action="store_true", default=None, help="a progress bar (on a terminal: default)"
+    )
     bar.add_argument("--no-progress", dest="progress", action="store_false", help="plain lines, also on a terminal")
     add("--verbose", type=int, default=1, help="0: silent, 1: progress, 2: also SB3's tables and messages")
     return parser
@@ -61,7 +64,7 @@ def read_hyperparams(args: argparse.Namespace) -> Hyperparams:
     hyperparams = parse({**entry, **overrides}, algorithm, where)
     if args.verbose > 0:
         print(f"Hyperparameters: {where}{'' if has_entry else f' (it has no entry for {args.env})'}")
-        print("  " + yaml.safe_dump(hyperparams.raw, sort_keys=False, default_flow_style=None).strip().replace("\n", "\n  "))
+        print(textwrap.indent(yaml.safe_dump(hyperparams.raw, sort_keys=False), "  "), end="")
     return hyperparams
 
 

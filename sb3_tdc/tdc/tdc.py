@@ -15,7 +15,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
 from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
@@ -319,7 +318,7 @@ class TDC(OffPolicyAlgorithm):
             self._diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, selected)
 
     def _update_actor(self, replay_data: ReplayBufferSamples) -> None:
-        diagnostics = {}
+        diagnostics: dict[str, th.Tensor] = {}
         if self.stochastic_actor:
             actions, log_prob = self.actor.action_log_prob(replay_data.observations)  # type: ignore[operator]
             ent_coef = self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
@@ -445,5 +444,5 @@ class TDC(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_ent_coef"]
 
 
-def _unique(parameters: list[th.nn.Parameter]) -> list[th.nn.Parameter]:
+def _unique(parameters: list[th.nn.Parameter]) -> list[th.Tensor]:
     return list({id(parameter): parameter for parameter in parameters}.values())

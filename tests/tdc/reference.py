@@ -156,6 +156,7 @@ class Reference:
     def _update_targets(self):  # Eq. 16
         pairs = list(zip(flatten(self.actor), flatten(self.target_actor), strict=True))
         for critic, target in zip(self.critics, self.target_critics, strict=True):
-            pairs += [(p, q) for pair, qair in zip(critic, target, strict=True) for p, q in zip(pair, qair, strict=True)]
+            for layer, target_layer in zip(critic, target, strict=True):
+                pairs += list(zip(layer, target_layer, strict=True))
         for online, target in pairs:
             target.data = self.tau * online.data + (1 - self.tau) * target.data

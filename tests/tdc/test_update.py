@@ -104,12 +104,10 @@ def reference_actor_weights(networks):
 
 
 @pytest.mark.parametrize("stochastic", [False, True], ids=["deterministic", "stochastic"])
-@pytest.mark.parametrize(
-    ("n_critics", "lam", "kappa"), [(2, 0.9, 1.0), (2, 0.0, 0.0), (1, 1.0, 0.3), (3, 0.5, 10.0)]
-)
+@pytest.mark.parametrize(("n_critics", "lam", "kappa"), [(2, 0.9, 1.0), (2, 0.0, 0.0), (1, 1.0, 0.3), (3, 0.5, 10.0)])
 def test_updates_equal_algorithm_1(monkeypatch, stochastic, n_critics, lam, kappa):
     """Five updates (two of them delayed): every weight, every target weight, and the temperature."""
-    settings = dict(lam=lam, kappa=kappa, gamma=0.97, tau=0.05)
+    settings = {"lam": lam, "kappa": kappa, "gamma": 0.97, "tau": 0.05}
     model = make_model(
         stochastic_actor=stochastic,
         learning_rate=1e-2,

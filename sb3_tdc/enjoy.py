@@ -1,0 +1,197 @@
+"""``python enjoy.py logs/tdc/Walker2d-v4_1``: watch, record or evaluate a trained agent."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import DependencyNotInstalled
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments
+from sb3_tdc.experiment import ALGORITHMS, check_env_id, make_envs
+from sb3_tdc.hyperparams import Hyperparams, parse
+from sb3_tdc.rendering import VideoWriter, choose_gl_backend, has_display
+from sb3_tdc.run_folder import RunFolder
+
+
+def make_parser() -> Parser:
+    """:return: RL Zoo's flags, and the folder of a run instead of ``--algo``, ``--env`` and ``--exp-id``"""
+    parser = Parser("Watch a trained agent: in a window where there is a display, with --record where there is none.")
+    add = parser.add_argument
+    add("run", nargs="?", type=Path, help="folder of a run, or a zip (else: the run of --algo, --env and --exp-id)")
+    add_common_arguments(parser, ALGORITHMS)
+    add("--env", default="HalfCheetah-v4", help="environment id")
+    add("--exp-id", type=int, default=0, help="number of the run (0: the latest)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--load-best", action="store_true", help="the best model instead of the last")
+    which.add_argument("--load-checkpoint", type=int, metavar="STEPS", help="the model saved at this step")
+    which.add_argument("--load-last-checkpoint", action="store_true", help="the last model of --save-freq")
+    add("--n-episodes", type=int, default=5, help="episodes to play")
+    add("-n", "--n-timesteps", type=int, default=-1, help="stop after so many steps (-1: no limit)")
+    add("--record", type=Path, metavar="FILE.mp4", help="write a video")
+    add("--no-render", action="store_true", help="no picture, only returns")
+    add("--stochastic", action="store_true", help="sampled instead of mean actions (SAC; TDC always takes the mean)")
+    add("--seed", type=int, default=0, help="seed of the environment")
+    add("--verbose", type=int, default=1, help="0: only the result, 1: every episode")
+    return parser
+
+
+def find_run(args: argparse.Namespace) -> RunFolder:
+    """:raises ValueError: if there is no such run"""
+    if args.run is not None:
+        return RunFolder.open(args.run)
+    return RunFolder.find(args.log_folder, args.algo, args.env, args.exp_id)
+
+
+def find_model(args: argparse.Namespace, run: RunFolder) -> Path:
+    """
+    :return: the zip that the arguments name
+    :raises ValueError: if there is none, with what there is
+    """
+    checkpoints = run.checkpoints()
+    if args.load_best:
+        path = run.best_model
+    elif args.load_checkpoint is not None or args.load_last_checkpoint:
+        steps = args.load_checkpoint if args.load_checkpoint is not None else max(checkpoints, default=-1)
+        if steps not in checkpoints:
+            known = f"there are those of steps {', '.join(map(str, checkpoints))}" if checkpoints else "it has none"
+            raise ValueError(
+                f"{run.path} has no saved model of step {steps}; {known} (train.py --save-freq makes them)"
+            )
+        path = checkpoints[steps]
+    else:
+        path = run.model
+    if not path.is_file():
+        others = [p.name for p in (run.model, run.best_model, *checkpoints.values()) if p.is_file()]
+        raise ValueError(f"{path} does not exist; in its folder are: {', '.join(others) or 'no models'}")
+    return path
+
+
+@dataclass
+class Trained:
+    """A model to load, and what it was trained with."""
+
+    path: Path
+    algo: str
+    env_id: str
+    hyperparams: Hyperparams
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    normalization: Path | None = None
+
+
+def find_trained(args: argparse.Namespace) -> Trained:
+    """
+    :return: the model that the arguments name; for a zip outside a run, the algorithm and the environment are theirs
+    :raises ValueError: if there is none
+    """
+    if args.run is not None and args.run.is_file():
+        apply_common_arguments(args)
+        hyperparams = parse({"n_timesteps": 1}, ALGORITHMS[args.algo], str(args.run))
+        return Trained(args.run, args.algo, args.env, hyperparams)
+    run = find_run(args)
+    path, trained = find_model(args, run), run.args
+    args.gym_packages = [*trained["gym_packages"], *args.gym_packages]
+    apply_common_arguments(args)
+    hyperparams = parse(run.config, ALGORITHMS[trained["algo"]], str(run.path / run.env_name / "config.yml"))
+    normalization = None
+    if hyperparams.normalize is not None:
+        normalization = run.normalization(path)
+        if not normalization.is_file():
+            raise ValueError(f"{normalization} is missing: {path.name} was trained on normalised observations")
+    return Trained(path, trained["algo"], trained["env"], hyperparams, trained["env_kwargs"], normalization)
+
+
+def play(model: BaseAlgorithm, env: VecEnv, args: argparse.Namespace, video: VideoWriter | None) -> list[float]:
+    """
+    Play episodes in one environment.
+
+    :return: the return of each finished episode, as the environment gave it (not normalised)
+    """
+    returns: list[float] = []
+    observation: Any = env.reset()
+    steps = 0
+    try:
+        while len(returns) < args.n_episodes and steps != args.n_timesteps:
+            if video is not None:
+                frame = env.render()
+                assert frame is not None
+                video.add(frame)
+            action, _ = model.predict(observation, deterministic=not args.stochastic)
+            observation, _, dones, infos = env.step(action)
+            steps += 1
+            if dones[0]:
+                episode = infos[0]["episode"]
+                returns.append(float(episode["r"]))
+                if args.verbose > 0:
+                    print(f"Episode {len(returns):>3}: return {episode['r']:10.2f}, {episode['l']} steps", flush=True)
+    except KeyboardInterrupt:
+        print("Stopped.")
+    return returns
+
+
+def _render_mode(args: argparse.Namespace, env_id: str) -> str | None:
+    """Decide what is drawn and say how; MuJoCo's backend is chosen before it is imported."""
+    if args.record is None and (args.no_render or not has_display()):
+        if not args.no_render:
+            print("There is no display: no window. To see the agent: --record FILE.mp4")
+        return None
+    if "mujoco" in str(gym.spec(env_id).entry_point):
+        print(choose_gl_backend())
+    return "human" if args.record is None else "rgb_array"
+
+
+def _run(args: argparse.Namespace) -> int:
+    trained = find_trained(args)
+    check_env_id(trained.env_id)
+    set_random_seed(args.seed)
+    render_mode = _render_mode(args, trained.env_id)
+
+    with ExitStack() as stack:
+        env = make_envs(
+            trained.env_id,
+            trained.hyperparams,
+            args.seed,
+            n_envs=1,
+            env_kwargs={**trained.env_kwargs, **args.env_kwargs, "render_mode": render_mode},
+            normalization=trained.normalization,
+            training=False,
+        )
+        stack.callback(env.close)
+        model = ALGORITHMS[trained.algo].load(trained.path, env=env, device=args.device, buffer_size=1)
+        print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")
+        video = None
+        if args.record is not None:
+            fps = env.metadata.get("render_fps", 30)
+            assert isinstance(fps, (int, float))
+            video = stack.enter_context(VideoWriter(args.record, fps))
+        returns = play(model, env, args, video)
+    if args.record is not None:
+        print(f"Wrote {args.record}")
+    if returns:
+        print(f"Return: {np.mean(returns):.2f} ± {np.std(returns):.2f} (mean ± std of {len(returns)} episodes)")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    :param argv: arguments, those of the process by default
+    :return: 0
+    """
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    try:
+        return _run(args)
+    except (ValueError, ImportError, DependencyNotInstalled) as error:
+        parser.fail(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""Pictures without a display: which OpenGL backend MuJoCo can use, and video files."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+_GL_BACKENDS = ("egl", "osmesa")
+_TRY_BACKEND = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
+
+
+def has_display() -> bool:
+    """:return: whether a window can be opened"""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def choose_gl_backend() -> str:
+    """
+    Set ``MUJOCO_GL`` to a backend that works without a display, unless it is set already or there is a display.
+
+    To be called before ``mujoco`` is imported: it reads the variable then.
+
+    :return: a sentence on what is used
+    :raises ValueError: if nothing works, with the commands that install one
+    """
+    if os.environ.get("MUJOCO_GL"):
+        return f"Rendering with MUJOCO_GL={os.environ['MUJOCO_GL']} (from the environment)"
+    if has_display():
+        return "Rendering with the display's OpenGL"
+    for backend in _GL_BACKENDS:
+        attempt = subprocess.run(
+            [sys.executable, "-c", _TRY_BACKEND], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True
+        )
+        if attempt.returncode == 0:
+            os.environ["MUJOCO_GL"] = backend
+            return f"Rendering with MUJOCO_GL={backend} (no display)"
+    raise ValueError(
+        "MuJoCo cannot render: there is no display, and neither EGL nor OSMesa works. "
+        "On Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 (or libosmesa6)"
+    )
+
+
+class VideoWriter:
+    """
+    A context that writes frames to a video file.
+
+    :param path: the file; its ending chooses the format (.mp4, .gif, ...)
+    :param fps: frames per second
+    :raises ImportError: if imageio or its ffmpeg is missing, with the command that installs them
+    """
+
+    def __init__(self, path: Path, fps: float):
+        try:
+            import imageio.v2 as imageio
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise ImportError('Recording needs imageio and ffmpeg: pip install "sb3-tdc[video]"') from error
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.writer: Any = imageio.get_writer(path, fps=fps)
+
+    def add(self, frame: np.ndarray) -> None:
+        """:param frame: (height, width, 3), uint8"""
+        self.writer.append_data(frame)
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.writer.close()

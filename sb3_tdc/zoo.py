@@ -1,0 +1,81 @@
+"""
+TDC in RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo tdc --env Hopper-v4``.
+
+The only module that imports ``rl_zoo3`` (extra ``[zoo]``).
+"""
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from sb3_tdc.hyperparams import hyperparams_file
+from sb3_tdc.tdc import TDC
+
+
+def register() -> None:
+    """
+    Make ``tdc`` known to RL Zoo's training, enjoying and Optuna search.
+
+    :raises ImportError: if rl_zoo3 is missing, with the command that installs it
+    """
+    try:
+        from rl_zoo3 import ALGOS, hyperparams_opt
+    except ModuleNotFoundError as error:
+        if error.name != "rl_zoo3":
+            raise
+        raise ImportError('RL Zoo is not installed: pip install "sb3-tdc[zoo]"') from error
+    ALGOS["tdc"] = TDC
+    hyperparams_opt.HYPERPARAMS_SAMPLER["tdc"] = sample_tdc_params
+    hyperparams_opt.HYPERPARAMS_CONVERTER["tdc"] = convert_tdc_params
+
+
+def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Optuna's search space: RL Zoo's for TD3, λ among the paper's candidates (and 0), and the quantiles.
+
+    :param trial: an ``optuna.Trial``
+    :return: keyword arguments of TDC
+    """
+    from rl_zoo3.hyperparams_opt import sample_td3_params
+
+    hyperparams = sample_td3_params(trial, n_actions, n_envs, additional_args)
+    hyperparams["lam"] = trial.suggest_float("lam", 0.0, 1.0, step=0.1)
+    hyperparams["policy_kwargs"]["n_quantiles"] = trial.suggest_categorical("n_quantiles", [16, 25, 64])
+    return {"action_noise": None, **hyperparams}  # no noise sampled is none, not TDC's default
+
+
+def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled: the parameters of a finished Optuna trial
+    :return: hyperparameters as in a YAML file
+    """
+    from rl_zoo3.hyperparams_opt import convert_offpolicy_params
+
+    hyperparams = convert_offpolicy_params(sampled)
+    if hyperparams.get("noise_type") is None:
+        hyperparams.pop("noise_type", None)
+        hyperparams.pop("noise_std", None)
+        hyperparams["action_noise"] = None
+    return hyperparams
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """
+    RL Zoo's command line (train, enjoy, ...) with TDC in it; for ``train --algo tdc`` without ``-conf``, with this
+    package's hyperparameters.
+
+    :param argv: arguments, those of the process by default
+    """
+    argv = list(sys.argv[1:] if argv is None else argv)
+    register()
+    from rl_zoo3.cli import main as zoo_main
+
+    trains_tdc = argv[:1] == ["train"] and ("tdc", "--algo") in zip(argv[1:], argv, strict=False)
+    if trains_tdc and not {"-conf", "--conf-file"} & set(argv):
+        argv += ["-conf", str(hyperparams_file("tdc"))]
+    sys.argv = ["sb3_tdc.zoo", *argv]
+    zoo_main()
+
+
+if __name__ == "__main__":
+    main()
