@@ -4,6 +4,7 @@ TDC in RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo td
 The only module that imports ``rl_zoo3`` (extra ``[zoo]``).
 """
 
+import itertools
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -61,20 +62,24 @@ def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    RL Zoo's command line (train, enjoy, ...) with TDC in it; for ``train --algo tdc`` without ``-conf``, with this
-    package's hyperparameters.
+    RL Zoo's ``train`` or ``enjoy`` with TDC in it; ``train --algo tdc`` without ``-conf`` takes this package's
+    hyperparameters.
 
     :param argv: arguments, those of the process by default
     """
     argv = list(sys.argv[1:] if argv is None else argv)
+    if argv[:1] not in (["train"], ["enjoy"]):
+        sys.exit("usage: python -m sb3_tdc.zoo {train,enjoy} [RL Zoo's arguments]")
     register()
-    from rl_zoo3.cli import main as zoo_main
+    from rl_zoo3.enjoy import enjoy
+    from rl_zoo3.train import train
 
-    trains_tdc = argv[:1] == ["train"] and ("tdc", "--algo") in zip(argv[1:], argv, strict=False)
-    if trains_tdc and not {"-conf", "--conf-file"} & set(argv):
-        argv += ["-conf", str(hyperparams_file("tdc"))]
-    sys.argv = ["sb3_tdc.zoo", *argv]
-    zoo_main()
+    command, *arguments = argv
+    trains_tdc = command == "train" and ("--algo", "tdc") in itertools.pairwise(arguments)
+    if trains_tdc and not {"-conf", "--conf-file"} & set(arguments):
+        arguments += ["-conf", str(hyperparams_file("tdc"))]
+    sys.argv = [f"sb3_tdc.zoo {command}", *arguments]  # RL Zoo reads its arguments from there
+    {"train": train, "enjoy": enjoy}[command]()
 
 
 if __name__ == "__main__":

@@ -187,6 +187,11 @@ class TDC(OffPolicyAlgorithm):
         self._initial_ent_coef()
         for name in ("lam", "learning_rate", "qf_learning_rate"):
             self._scheduled(name, progress_remaining=1.0)
+        if self.stochastic_actor != self.policy_kwargs["stochastic_actor"]:
+            raise ValueError(
+                f"stochastic_actor must be {self.policy_kwargs['stochastic_actor']}, as in the saved model, "
+                f"got {self.stochastic_actor}"
+            )
 
     def _initial_ent_coef(self) -> float:
         coefficient = self.ent_coef
