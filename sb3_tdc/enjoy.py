@@ -166,6 +166,7 @@ def _run(args: argparse.Namespace) -> int:
         )
         stack.callback(env.close)
         model = ALGORITHMS[trained.algo].load(trained.path, env=env, device=args.device, buffer_size=1)
+        env.seed(args.seed)  # loading has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")
         video = None
         if args.record is not None:

@@ -1,7 +1,10 @@
 """One run: environments, model, callbacks, run folder. Called by the command line, by searches and by tests."""
 
 import difflib
+import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -75,6 +78,14 @@ class Experiment:
     verbose: int = 1
 
 
+class SetupError(ValueError):
+    """A run that could not begin, with the reason in one sentence."""
+
+
+# What constructors of environments, wrappers, algorithms and callbacks raise for what they do not allow
+_SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportError, OSError, EOFError, gym.error.Error)
+
+
 @dataclass(frozen=True)
 class Outcome:
     """How a run ended: the trained model, and whether the user stopped it before its last step."""
@@ -133,6 +144,8 @@ def make_envs(
     )
     for wrapper in hyperparams.vec_env_wrapper:
         env = wrapper(env)
+    if hyperparams.frame_stack is not None:  # before normalising: replay stores what VecNormalize was given
+        env = VecFrameStack(env, hyperparams.frame_stack)
     if hyperparams.normalize is not None:
         if normalization is not None:
             env = VecNormalize.load(str(normalization), env)
@@ -140,8 +153,6 @@ def make_envs(
             env = VecNormalize(env, **hyperparams.normalize)
         if not training:
             env.training, env.norm_reward = False, False
-    if hyperparams.frame_stack is not None:
-        env = VecFrameStack(env, hyperparams.frame_stack)
     return env
 
 
@@ -149,33 +160,37 @@ def train(experiment: Experiment) -> Outcome:
     """
     Train from the first step to the last, or to Ctrl-C; either way the model is saved.
 
+    :raises SetupError: if the run cannot begin; its folder is removed
     :raises NonFiniteError: if training diverged; saved models stay as they are
     """
-    env = _make_training_envs(experiment)
-    model = _make_model(experiment, env)
-    eval_env = None
-    progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
-    try:
-        model.set_logger(_make_logger(experiment))
-        if experiment.eval_freq > 0:
-            eval_env = model._wrap_env(_make_eval_envs(experiment), verbose=0, monitor_wrapper=False)
+    with ExitStack() as stack:
+        try:
+            env = stack.enter_context(_closing(_make_training_envs(experiment)))
+            model = _make_model(experiment, env)
+            model.set_logger(_make_logger(experiment))
+            stack.callback(model.logger.close)
+            eval_env = None
+            if experiment.eval_freq > 0:
+                eval_env = stack.enter_context(_closing(_make_eval_envs(experiment)))
+                eval_env = model._wrap_env(eval_env, verbose=0, monitor_wrapper=False)
+            progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
+            callbacks = [*_make_callbacks(experiment, eval_env, progress), progress]
+        except _SETUP_ERRORS as error:
+            stack.close()
+            shutil.rmtree(experiment.folder.path)
+            raise SetupError(" ".join(str(error).split()) or repr(error)) from error
+        stack.callback(progress.close)
         interrupted = False
         try:
             model.learn(
                 experiment.hyperparams.n_timesteps,
-                callback=[*_make_callbacks(experiment, eval_env, progress), progress],
+                callback=callbacks,
                 log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
             )
         except KeyboardInterrupt:
             interrupted = True
         _save(experiment, model)
         return Outcome(model, interrupted)
-    finally:
-        progress.close()
-        for envs in (env, eval_env):
-            _close(envs)
-        if model._logger is not None:
-            model.logger.close()
 
 
 def _make_training_envs(experiment: Experiment) -> VecEnv:
@@ -292,12 +307,12 @@ def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
         model.save_replay_buffer(folder.replay_buffer)
 
 
-def _close(env: VecEnv | None) -> None:
-    try:
-        if env is not None:
-            env.close()
-    except (BrokenPipeError, ConnectionResetError, EOFError):
-        pass  # Ctrl-C has reached the processes of the environments before
+@contextmanager
+def _closing(env: VecEnv) -> Iterator[VecEnv]:
+    yield env
+    # Ctrl-C may have reached the processes of the environments before
+    with suppress(BrokenPipeError, ConnectionResetError, EOFError):
+        env.close()
 
 
 class _SaveNormalization(BaseCallback):

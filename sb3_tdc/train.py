@@ -12,7 +12,6 @@ from typing import Any, NoReturn
 
 import numpy as np
 import yaml
-from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments
@@ -147,7 +146,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except NonFiniteError as error:
         print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)
         return 1
-    except (ValueError, AssertionError, ImportError, DependencyNotInstalled) as error:
+    except ValueError as error:
         parser.fail(error)
     if args.verbose > 0:
         print(f"Saved {folder.model} after {timedelta(seconds=round(time.monotonic() - start))}")

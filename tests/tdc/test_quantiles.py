@@ -42,7 +42,7 @@ def assert_matches_reference(current, target, kappa):
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e2, 1e5])
 def test_loss_and_gradient_are_exact_to_float32(kappa, n_quantiles, scale):
     generator = th.Generator().manual_seed(n_quantiles)
-    # Critics' layout: (C, B, N) transposed, so not contiguous. Two critics, and far more rows than one chunk for N = 200
+    # The critics' layout, (C, B, N) transposed: not contiguous; with N = 200 many chunks of rows
     current = (th.randn(2, 40, n_quantiles, generator=generator) * scale).transpose(0, 1)
     target = th.randn(40, n_quantiles, generator=generator) * scale
     assert_matches_reference(current, target, kappa)

@@ -181,10 +181,8 @@ def test_actions_are_the_mean_action(stochastic_actor):
     actions, _ = model.predict(observations, deterministic=False)
     assert np.array_equal(actions, model.predict(observations, deterministic=True)[0])
     tensor = th.from_numpy(observations)
-    if stochastic_actor:
-        normalised = th.tanh(model.actor.mu(model.actor.latent_pi(tensor)))
-    else:
-        normalised = model.actor.mu(tensor)
+    actor = model.actor
+    normalised = th.tanh(actor.mu(actor.latent_pi(tensor))) if stochastic_actor else actor.mu(tensor)
     # Bounds −0.4 and 2: centre 0.8, half-width 1.2
     np.testing.assert_allclose(actions, 0.8 + 1.2 * normalised.detach().numpy(), rtol=1e-5, atol=1e-6)
 

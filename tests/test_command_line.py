@@ -1,0 +1,281 @@
+"""``train.py`` and ``enjoy.py`` from end to end, in a temporary folder."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_tdc import TDC, enjoy, train
+from sb3_tdc.arguments import Parser
+from sb3_tdc.run_folder import RunFolder
+
+ROOT = Path(__file__).parent.parent
+SMALL = ["-params", "policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
+SMALL_ANY = ["-params", "policy_kwargs:{net_arch: [16, 16]}", "learning_starts:100", "batch_size:16"]
+
+
+def run_train(folder, *args, algo="tdc", env="Hopper-v4", n=300, small=SMALL, seed=1):
+    argv = ["--algo", algo, "--env", env, "-n", n, "--seed", seed, "-f", folder, "--eval-freq", 150]
+    argv += ["--eval-episodes", 2, "--device", "cpu", *small, *args]
+    return train.main([str(a) for a in argv])
+
+
+def run_enjoy(*args):
+    return enjoy.main([*map(str, args), "--no-render", "--n-episodes", "2", "--device", "cpu"])
+
+
+def tags(folder):
+    (events,) = Path(folder).glob("events.out.tfevents.*")
+    accumulator = EventAccumulator(str(events)).Reload()
+    return accumulator, set(accumulator.Tags()["scalars"])
+
+
+def test_a_run_leaves_what_rl_zoo_leaves(tmp_path, capsys):
+    assert run_train(tmp_path, "--save-freq", 100, "--save-replay-buffer") == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    assert {path.name for path in folder.iterdir() if "tfevents" not in path.name} == {
+        "0.monitor.csv", "Hopper-v4", "Hopper-v4.zip", "best_model.zip", "evaluations.npz", "progress.csv",
+        "replay_buffer.pkl", *(f"rl_model_{n}_steps.zip" for n in (100, 200, 300)),
+        *(f"rl_model_replay_buffer_{n}_steps.pkl" for n in (100, 200, 300)),
+    }  # fmt: skip
+    assert {path.name for path in (folder / "Hopper-v4").iterdir()} == {"args.yml", "command.txt", "config.yml"}
+    config = yaml.safe_load((folder / "Hopper-v4" / "config.yml").read_text())
+    assert (config["lam"], config["n_timesteps"], config["learning_starts"]) == (0.9, 300, 100)
+    assert yaml.safe_load((folder / "Hopper-v4" / "args.yml").read_text())["seed"] == 1
+    with np.load(folder / "evaluations.npz") as evaluations:
+        assert evaluations["timesteps"].tolist() == [150, 300]
+        assert evaluations["results"].shape == (2, 2)
+
+    accumulator, scalars = tags(folder)
+    assert {"eval/mean_reward", "train/critic_loss", "train/lam", "rollout/ep_rew_mean"} <= scalars
+    assert "_hparams_/session_start_info" in accumulator.summary_metadata  # the HParams tab
+
+    screen = capsys.readouterr().out
+    assert "tdc.yml, Hopper-v4" in screen
+    assert "      300 steps 100.0%" in screen
+    assert "| eval " in screen
+    assert f"python enjoy.py {folder}" in screen
+    model = TDC.load(folder / "Hopper-v4.zip")
+    assert (model.num_timesteps, model.lam, model.learning_rate) == (300, 0.9, 2e-4)
+
+
+def test_the_seed_decides_everything(tmp_path):
+    for seed in (1, 1, 2):
+        assert run_train(tmp_path, seed=seed) == 0
+    a, b, c = (TDC.load(tmp_path / "tdc" / f"Hopper-v4_{i}" / "Hopper-v4.zip").policy.state_dict() for i in (1, 2, 3))
+    assert all(th.equal(a[k], b[k]) for k in a)
+    assert any(not th.equal(a[k], c[k]) for k in a)
+
+
+@pytest.mark.parametrize("algo", ["td3", "sac", "ddpg"])
+def test_the_baselines_run_through_the_same_pipeline(tmp_path, algo, capsys):
+    assert run_train(tmp_path, algo=algo, small=SMALL_ANY) == 0
+    assert run_enjoy("--algo", algo, "--env", "Hopper-v4", "-f", tmp_path) == 0
+    assert "mean ± std of 2 episodes" in capsys.readouterr().out
+
+
+def test_an_environment_without_an_entry_gets_the_default(tmp_path, capsys):
+    assert run_train(tmp_path, "-tb", "", env="Pendulum-v1") == 0
+    assert "tdc.yml, default (it has no entry for Pendulum-v1)" in capsys.readouterr().out
+    assert not list((tmp_path / "tdc" / "Pendulum-v1_1").glob("events*"))  # -tb "": off
+
+
+def test_stochastic_head_several_environments_and_normalisation(tmp_path, capsys):
+    options = [*SMALL, "stochastic_actor:true", "n_envs:2", "normalize:true", "frame_stack:2"]
+    assert run_train(tmp_path, "--vec-env", "subproc", "--n-eval-envs", 2, small=options) == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    assert (folder / "Hopper-v4" / "vecnormalize.pkl").is_file()
+    assert (folder / "best_model_vecnormalize.pkl").is_file()
+    assert {"0.monitor.csv", "1.monitor.csv"} <= {path.name for path in folder.iterdir()}
+    capsys.readouterr()
+    assert run_enjoy(folder) == 0
+    returns = capsys.readouterr().out
+    assert run_enjoy(folder, "--load-best") == 0
+    # The agent sees normalised observations, but the returns are the environment's: a Hopper lives on 1 a step
+    episodes = [line.split() for line in returns.splitlines() if line.startswith("Episode")]
+    assert all(float(words[3].rstrip(",")) > 0.5 * float(words[4]) for words in episodes)
+
+    (folder / "Hopper-v4" / "vecnormalize.pkl").unlink()
+    with pytest.raises(SystemExit):
+        run_enjoy(folder)
+    assert "vecnormalize.pkl is missing" in capsys.readouterr().err
+
+
+def test_going_on_from_a_saved_model(tmp_path):
+    assert run_train(tmp_path, "--save-replay-buffer", small=[*SMALL, "normalize:true"]) == 0
+    first = tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip"
+    before = TDC.load(first)
+    assert run_train(tmp_path, "-i", first, n=120, small=[*SMALL, "normalize:true"]) == 0
+    after = TDC.load(tmp_path / "tdc" / "Hopper-v4_2" / "Hopper-v4.zip")
+    assert after._n_updates == before._n_updates + 20  # warm-up again, then on from the saved count
+
+
+def test_enjoy_finds_models(tmp_path, capsys):
+    run_train(tmp_path, "--save-freq", 100)
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    by_name = ["--env", "Hopper-v4", "-f", tmp_path]
+    for args, model in (
+        ([folder], "Hopper-v4.zip"),
+        (by_name, "Hopper-v4.zip"),
+        ([*by_name, "--exp-id", 1, "--load-best"], "best_model.zip"),
+        ([folder, "--load-checkpoint", 200], "rl_model_200_steps.zip"),
+        ([folder, "--load-last-checkpoint"], "rl_model_300_steps.zip"),
+        ([folder / "best_model.zip", "--env", "Hopper-v4"], "best_model.zip"),
+    ):
+        capsys.readouterr()
+        assert run_enjoy(*args) == 0
+        assert f"{folder / model}: tdc on Hopper-v4" in capsys.readouterr().out
+    for args, message in (
+        ([folder, "--load-checkpoint", 250], "no saved model of step 250; there are those of steps 100, 200, 300"),
+        (["--env", "Hoper-v4", "-f", tmp_path], "no run of tdc on Hoper-v4"),
+        ([*by_name, "--exp-id", 3], "no run 3 of tdc on Hopper-v4"),
+        ([tmp_path], "is not the folder of a run"),
+    ):
+        with pytest.raises(SystemExit) as exit_:
+            run_enjoy(*args)
+        assert exit_.value.code == 2
+        assert message in capsys.readouterr().err
+
+
+def test_returns_are_those_of_the_mean_action(tmp_path, capsys):
+    run_train(tmp_path)
+    capsys.readouterr()
+    run_enjoy("--env", "Hopper-v4", "-f", tmp_path, "--seed", 5)
+    shown = capsys.readouterr().out
+    import gymnasium as gym
+
+    model = TDC.load(tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip")
+    env, done, total = gym.make("Hopper-v4"), False, 0.0
+    observation, _ = env.reset(seed=5)
+    while not done:
+        observation, reward, terminated, truncated, _ = env.step(model.predict(observation)[0])
+        total, done = total + reward, terminated or truncated
+    assert f"Episode   1: return {total:10.2f}" in shown
+
+
+def test_recording_without_a_display(tmp_path, capsys, monkeypatch):
+    imageio = pytest.importorskip("imageio.v2")
+    pytest.importorskip("imageio_ffmpeg")
+    run_train(tmp_path)
+    environment = {k: v for k, v in os.environ.items() if k not in {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"}}
+    video = tmp_path / "videos" / "hopper.mp4"
+    command = [
+        sys.executable,
+        ROOT / "enjoy.py",
+        tmp_path / "tdc" / "Hopper-v4_1",
+        "--record",
+        video,
+        "--n-episodes",
+        "1",
+    ]
+    done = subprocess.run(list(map(str, command)), env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "Rendering with MUJOCO_GL=" in done.stdout
+    frames = list(imageio.get_reader(video).iter_data())
+    steps = int(done.stdout.split("return")[1].split(",")[1].split()[0])
+    assert len(frames) == steps
+    assert frames[0].shape[2] == 3
+    assert np.std(frames[0]) > 10  # not a black picture
+    assert np.abs(frames[-1].astype(float) - frames[0]).mean() > 0.1  # it moves
+
+
+@pytest.mark.parametrize("send", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
+    """A Ctrl-C reaches the whole process group, as in a terminal."""
+    options = ["-f", tmp_path, "--eval-freq", "-1", "--vec-env", vec_env, *SMALL, "n_envs:2"]
+    command = [sys.executable, ROOT / "train.py", "--env", "Hopper-v4", "-n", "1000000", *options]
+    process = subprocess.Popen(
+        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    monitor = tmp_path / "tdc" / "Hopper-v4_1" / "progress.csv"
+    deadline = time.monotonic() + 120
+    while not (monitor.exists() and monitor.stat().st_size > 0) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    if send == signal.SIGINT:
+        os.killpg(process.pid, send)
+    else:
+        process.send_signal(send)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    model = tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip"
+    assert (
+        f"python train.py --algo tdc --env Hopper-v4 -n {1_000_000 - TDC.load(model).num_timesteps} -i {model}" in out
+    )
+
+
+def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
+    assert run_train(tmp_path, "--save-freq", 100, "-params", *SMALL[1:], "learning_rate:1.0e+30", small=[]) == 1
+    assert "Training has stopped" in capsys.readouterr().err
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    assert (folder / "rl_model_100_steps.zip").is_file()
+    assert not (folder / "Hopper-v4.zip").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--env", "Walker3d-v4"], "There is no environment 'Walker3d-v4'; did you mean Walker2d-v4"),
+        (["--algo", "tdd"], "unknown algorithm 'tdd'; did you mean 'tdc'?; known: tdc, td3, sac, ddpg"),
+        (["--evalfreq", "3"], "unknown argument '--evalfreq'; did you mean '--eval-freq'?"),
+        (["-n", "many"], "argument -n/--n-timesteps: invalid int value: 'many'"),
+        (["-params", "lam"], "must be key:value, got 'lam'"),
+        (["-params", "lam:-1"], "lam must be a finite number of at least 0.0, got -1"),
+        (["-params", "lamb:1"], "command line (-params): unknown key 'lamb'; did you mean 'lam'?"),
+        (["-params", "lam:[1"], "the value of lam is not valid YAML: '[1'"),
+        (["-conf", "nothing.yml"], "nothing.yml: No such file"),
+        (["-i", "nothing.zip"], "-i must be the zip of a model, got nothing.zip"),
+        (["--eval-episodes", "0"], "--eval-episodes must be at least 1, got 0"),
+        (["--gym-packages", "no_such_package"], "there is no module 'no_such_package': pip install no_such_package"),
+        (["--env", "CartPole-v1"], "env must have a Box action space"),
+        (["--env-kwargs", "colour:red"], "colour"),
+        (["--device", "gpu"], "gpu"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_command_lines_get_one_sentence(tmp_path, capsys, args, message):
+    with pytest.raises(SystemExit) as exit_:
+        run_train(tmp_path, *args, small=[])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+    assert not list(tmp_path.glob("*/*"))  # no folder of a run that never began
+
+
+def test_a_missing_package_gets_its_command(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    with pytest.raises(SystemExit):
+        run_train(tmp_path, "--progress")
+    assert 'pip install "sb3-tdc[progress]"' in capsys.readouterr().err
+
+
+def test_the_bar_shows_steps_rate_and_evaluation(tmp_path, capsys):
+    pytest.importorskip("tqdm")
+    assert run_train(tmp_path, "--progress") == 0
+    error = capsys.readouterr().err
+    assert "300/300" in error
+    assert "steps/s" in error
+    assert "eval " in error
+
+
+def test_runs_that_start_at_once_get_a_folder_each(tmp_path):
+    folders = [RunFolder.create(tmp_path, "tdc", "ALE/Pong-v5") for _ in range(3)]
+    assert [f.path.name for f in folders] == ["ALE-Pong-v5_1", "ALE-Pong-v5_2", "ALE-Pong-v5_3"]
+    assert RunFolder.create(tmp_path, "tdc", "ALE/Pong-v5", unique=True).path.name.startswith("ALE-Pong-v5_4_")
+
+
+def test_flags_cannot_be_abbreviated_by_accident():
+    parser = Parser("")
+    parser.add_argument("--eval-freq", type=int)
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--eval", "3"])

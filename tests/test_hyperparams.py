@@ -1,0 +1,163 @@
+"""YAML files: Table 1 as printed, the default under every entry, and what is said of mistakes."""
+
+import re
+
+import pytest
+import torch as th
+import yaml
+from stable_baselines3 import DDPG, HerReplayBuffer
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_tdc import TDC
+from sb3_tdc.experiment import ALGORITHMS
+from sb3_tdc.hyperparams import hyperparams_file, parse, read_entry, suggest
+
+# Table 1: steps, warm-up, λ, τ, learning rates of actor and critics
+TABLE_1 = {
+    "HalfCheetah-v4": (1_500_000, 25_000, 1.0, 0.005, 3e-4, 3e-4),
+    "Walker2d-v4": (4_000_000, 30_000, 1.0, 0.005, 3e-4, 3e-4),
+    "Humanoid-v4": (5_000_000, 5_000, 1.0, 0.0005, 3e-4, 2e-4),
+    "Ant-v4": (4_000_000, 5_000, 0.9, 0.005, 2e-4, 2e-4),
+    "Hopper-v4": (1_500_000, 5_000, 0.9, 0.005, 2e-4, 2e-4),
+}
+
+
+def parse_tdc(entry, algorithm=TDC):
+    return parse({"n_timesteps": 1, **entry}, algorithm, "file.yml, Env-v0")
+
+
+@pytest.mark.parametrize("env_id", TABLE_1)
+def test_table_1(env_id):
+    entry, has_entry = read_entry(hyperparams_file("tdc"), env_id)
+    assert has_entry
+    h = parse(entry, TDC, "")
+    m = h.model
+    rates = (m["learning_rate"], m["qf_learning_rate"])
+    assert (h.n_timesteps, m["learning_starts"], m["lam"], m["tau"], *rates) == TABLE_1[env_id]
+    assert (m["gamma"], m["kappa"], m["policy_delay"], m["batch_size"], m["buffer_size"]) == (0.99, 1, 2, 256, 10**6)
+    assert (m["target_policy_noise"], m["target_noise_clip"]) == (0.2, 0.5)
+    assert (h.noise_type, h.noise_std) == ("normal", 0.1)
+    assert m["policy_kwargs"] == {"net_arch": [256, 256], "n_quantiles": 64}
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_file_is_valid_in_every_entry(algo):
+    path = hyperparams_file(algo)
+    for env_id in yaml.safe_load(path.read_text()):
+        entry, _ = read_entry(path, env_id)
+        h = parse(entry, ALGORITHMS[algo], str(path))
+        assert h.model["policy_kwargs"]["net_arch"] == [256, 256]
+        if env_id != "default":  # all algorithms run as long, and warm up as long
+            assert (h.n_timesteps, h.model["learning_starts"]) == TABLE_1[env_id][:2]
+
+
+def test_the_default_lies_under_every_entry(tmp_path):
+    path = tmp_path / "my.yml"
+    path.write_text("default: {n_timesteps: 7, lam: 0.5}\nA-v0: {lam: 0.2}\n")
+    assert read_entry(path, "A-v0") == ({"n_timesteps": 7, "lam": 0.2}, True)
+    assert read_entry(path, "B-v0") == ({"n_timesteps": 7, "lam": 0.5}, False)
+
+
+def test_values_become_what_the_constructor_wants():
+    h = parse_tdc(
+        {
+            "n_timesteps": "1e6",
+            "learning_rate": "3e-4",  # YAML reads this as a text
+            "lam": "lin_0.9",
+            "train_freq": [2, "episode"],
+            "gradient_steps": -1,
+            "ent_coef": 0.2,
+            "action_noise": 0.3,
+            "policy_kwargs": {
+                "net_arch": {"pi": [8], "qf": [9]},
+                "activation_fn": "nn.ELU",
+                "optimizer_class": "AdamW",
+            },
+            "normalize": {"norm_reward": False},
+            "gamma": 0.9,
+            "replay_buffer_class": "HerReplayBuffer",
+            "env_wrapper": [{"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 5}}],
+        }
+    )
+    assert (h.n_timesteps, h.model["learning_rate"], h.model["train_freq"]) == (1_000_000, 3e-4, (2, "episode"))
+    assert isinstance(h.model["lam"], LinearSchedule)
+    assert h.model["lam"](0.5) == pytest.approx(0.45)
+    assert (h.model["ent_coef"], h.model["action_noise"]) == (0.2, 0.3)
+    assert h.model["policy_kwargs"]["activation_fn"] is th.nn.ELU
+    assert h.model["policy_kwargs"]["optimizer_class"] is th.optim.AdamW
+    assert h.model["replay_buffer_class"] is HerReplayBuffer
+    assert h.normalize == {"norm_reward": False, "gamma": 0.9}
+    assert len(h.env_wrapper) == 1
+    assert parse_tdc({"normalize": False}).normalize is None
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"learning_rte": 1}, "file.yml, Env-v0: unknown key 'learning_rte'; did you mean 'learning_rate'?"),
+        ({"Lam": 1}, "unknown key 'Lam'; did you mean 'lam'?"),
+        ({"seed": 1}, "unknown key 'seed'"),
+        ({"gamma": "high"}, "file.yml, Env-v0: gamma must be a number, got 'high'"),
+        ({"batch_size": 2.5}, "batch_size must be an integer, got 2.5"),
+        ({"batch_size": True}, "batch_size must be an integer, got True"),
+        ({"stochastic_actor": 1}, "stochastic_actor must be true or false, got 1"),
+        ({"lam": "sometimes"}, "lam must be a number or a schedule (\"lin_\" and a number), got 'sometimes'"),
+        ({"train_freq": [1, 2, 3]}, "train_freq must be an integer or a list of an integer, a text, got [1, 2, 3]"),
+        (
+            {"policy_kwargs": "dict(net_arch=[64])"},
+            "policy_kwargs must be a mapping or null, got 'dict(net_arch=[64])'",
+        ),
+        ({"policy_kwargs": {"n_quantile": 3}}, "policy_kwargs: unknown key 'n_quantile'; did you mean 'n_quantiles'?"),
+        ({"policy_kwargs": {"activation_fn": "os.system"}}, "activation_fn must be the name of a Module class"),
+        ({"policy_kwargs": {"activation_fn": "ReLUU"}}, "'ReLUU' names no Module class"),
+        ({"replay_buffer_class": "no.such.Buffer"}, "there is no module 'no'"),
+        ({"policy": "MlpPolic"}, "unknown policy 'MlpPolic'; did you mean 'MlpPolicy'?"),
+        ({"noise_type": "pink"}, "noise_type must be one of normal, ornstein-uhlenbeck, got 'pink'"),
+        ({"n_envs": 0}, "n_envs must be at least 1, got 0"),
+        ({"env_wrapper": "print"}, "env_wrapper must name a class"),
+        ({"callback": {"a.B": {}, "c.D": {}}}, "callback must name a class, or map it to its keyword arguments"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_mistakes_are_named(entry, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        parse_tdc(entry)
+    assert "\n" not in str(error.value)
+
+
+def test_another_algorithm_has_another_schema():
+    with pytest.raises(ValueError, match="unknown key 'lam'"):
+        parse_tdc({"lam": 0.5}, DDPG)
+
+
+def test_nothing_is_evaluated(tmp_path):
+    path = tmp_path / "evil.yml"
+    path.write_text(f"A-v0: {{n_timesteps: !!python/object/apply:pathlib.Path.touch [{tmp_path}/touched]}}")
+    with pytest.raises(ValueError, match="is not valid YAML"):
+        read_entry(path, "A-v0")
+    with pytest.raises(ValueError, match="policy_kwargs must be a mapping"):
+        parse_tdc({"policy_kwargs": f"open('{tmp_path}/touched', 'w')"})
+    assert not (tmp_path / "touched").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "No such file"),
+        ("[1, 2]", "must map environment ids to hyperparameters"),
+        ("A-v0: 3", "must map environment ids to hyperparameters"),
+        ("{", "is not valid YAML"),
+        ("Hopper-v4: {lam: 1}", "has no entry for Hoper-v4 and no default; did you mean 'Hopper-v4'?"),
+    ],
+)
+def test_files_that_cannot_be_used(tmp_path, text, message):
+    path = tmp_path / "my.yml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=r"my\.yml") as error:
+        read_entry(path, "Hoper-v4")
+    assert message in str(error.value)
+
+
+def test_suggestions_need_not_exist():
+    assert suggest("zzz", ["lam", "kappa"]) == ""
