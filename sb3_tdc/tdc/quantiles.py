@@ -87,21 +87,57 @@ def _check_shapes(current: th.Tensor, target: th.Tensor) -> None:
         )
 
 
-def _rows(current: th.Tensor, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, list[slice]]:
-    """One row per transition and critic, (B·C, N) and (B·C, M), and the chunks of rows that fit the cache."""
-    n_critics, n_quantiles, n_targets = current.shape[1], current.shape[2], target.shape[1]
-    rows = current.reshape(-1, n_quantiles)
-    target_rows = target.repeat_interleave(n_critics, dim=0)
-    size = max(1, _CHUNK_ELEMENTS // (n_quantiles * n_targets))
-    return rows, target_rows, [slice(i, i + size) for i in range(0, len(rows), size)]
+def _rows(current: th.Tensor, target: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """One row per transition and critic: (B·C, N) and (B·C, M)."""
+    return current.reshape(-1, current.shape[2]), target.repeat_interleave(current.shape[1], dim=0)
+
+
+def _row_chunks(n_rows: int, pairs: int) -> list[slice]:
+    """Slices of rows whose all-pairs differences fit the cache together."""
+    size = max(1, _CHUNK_ELEMENTS // pairs)
+    return [slice(i, min(i + size, n_rows)) for i in range(0, n_rows, size)]
+
+
+class RowGradient:
+    """
+    Slope of the quantile-Huber loss on rows of quantiles, in closed passes over one small buffer that is kept.
+
+    With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the slope of ρ at z_k summed over the targets is
+    (1 − 2τ_k)·Σ_j max(c, 0) − (1 − τ_k)·Σ_j c. Autograd through all pairs is some 30 times slower.
+
+    :param n_rows: R
+    :param n_quantiles: N
+    :param n_targets: M
+    :param scale: factor of the result
+    :param like: a tensor of the dtype and device to work with
+    """
+
+    def __init__(self, n_rows: int, n_quantiles: int, n_targets: int, scale: float, like: th.Tensor):
+        levels = quantile_midpoints(n_quantiles, like.device).to(like.dtype)
+        self.weight_positive = (1 - 2 * levels) * scale
+        self.weight_all = (1 - levels) * -scale
+        self.chunks = _row_chunks(n_rows, n_quantiles * n_targets)
+        self.delta = like.new_empty(self.chunks[0].stop, n_quantiles, n_targets)
+        self.sum_all, self.sum_positive = like.new_empty(n_rows, n_quantiles), like.new_empty(n_rows, n_quantiles)
+
+    def __call__(self, rows: th.Tensor, target_rows: th.Tensor, kappa: float) -> th.Tensor:
+        """
+        :param rows: (R, N)
+        :param target_rows: (R, M)
+        :return: (R, N), overwritten by the next call
+        """
+        for chunk in self.chunks:
+            z, y = rows[chunk, :, None], target_rows[chunk, None, :]
+            delta = th.sub(y, z, out=self.delta[: len(z)])  # Eq. 8: [row, k, j] = y_j − z_k
+            slope = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
+            th.sum(slope, dim=-1, out=self.sum_all[chunk])
+            th.sum(slope.relu_(), dim=-1, out=self.sum_positive[chunk])
+        return self.sum_positive.mul_(self.weight_positive).addcmul_(self.sum_all, self.weight_all)
 
 
 def quantile_huber_gradient(current: th.Tensor, target: th.Tensor, kappa: float = 1.0) -> th.Tensor:
     """
-    Gradient of :func:`quantile_huber_loss` with respect to ``current``, in closed passes over one small buffer.
-
-    With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the slope of ρ at z_k summed over the targets is
-    (1 − 2τ_k)·Σ_j max(c, 0) − (1 − τ_k)·Σ_j c. Autograd through all pairs is some 30 times slower.
+    Gradient of :func:`quantile_huber_loss` with respect to ``current`` (see :class:`RowGradient`).
 
     :param current: (B, C, N)
     :param target: (B, M)
@@ -110,16 +146,10 @@ def quantile_huber_gradient(current: th.Tensor, target: th.Tensor, kappa: float 
     :raises ValueError: if the shapes do not fit
     """
     _check_shapes(current, target)
-    rows, target_rows, chunks = _rows(current.detach(), target.detach())
-    sum_all, sum_positive = th.empty_like(rows), th.empty_like(rows)
-    for chunk in chunks:
-        delta = target_rows[chunk, None, :] - rows[chunk, :, None]  # Eq. 8: [row, k, j] = y_j − z_k
-        slope = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
-        th.sum(slope, dim=-1, out=sum_all[chunk])
-        th.sum(slope.relu_(), dim=-1, out=sum_positive[chunk])
-    levels = quantile_midpoints(current.shape[2], current.device).to(current.dtype)
-    gradient = sum_positive.mul_(1 - 2 * levels).sub_(sum_all.mul_(1 - levels))
-    return gradient.div_(current.shape[0] * current.shape[2] * target.shape[1]).view(current.shape)
+    rows, target_rows = _rows(current.detach(), target.detach())
+    scale = 1 / (current.shape[0] * current.shape[2] * target.shape[1])
+    gradient = RowGradient(*rows.shape, target.shape[1], scale, rows)
+    return gradient(rows, target_rows, kappa).view(current.shape)
 
 
 def _huber(distance: th.Tensor, kappa: float) -> th.Tensor:
@@ -135,9 +165,9 @@ class _QuantileHuberLoss(th.autograd.Function):
     def forward(ctx: Any, current: th.Tensor, target: th.Tensor, kappa: float) -> th.Tensor:
         ctx.save_for_backward(current, target)
         ctx.kappa = kappa
-        rows, target_rows, chunks = _rows(current, target)
+        rows, target_rows = _rows(current, target)
         sum_below, sum_above = th.empty_like(rows), th.empty_like(rows)
-        for chunk in chunks:
+        for chunk in _row_chunks(len(rows), rows.shape[1] * target.shape[1]):
             delta = target_rows[chunk, None, :] - rows[chunk, :, None]  # Eq. 8
             th.sum(_huber(delta.clamp(min=0), kappa), dim=-1, out=sum_above[chunk])
             th.sum(_huber(delta.neg_().clamp_(min=0), kappa), dim=-1, out=sum_below[chunk])

@@ -1,0 +1,93 @@
+"""``python -m sb3_tdc.plot RUN [RUN ...]``: learning curves of runs, from their evaluations."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_tdc.arguments import Parser
+from sb3_tdc.run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class Curve:
+    """
+    The evaluations of one run.
+
+    :param label: algorithm and seed
+    :param timesteps: (evaluations,)
+    :param returns: (evaluations, episodes)
+    """
+
+    label: str
+    env_id: str
+    timesteps: np.ndarray
+    returns: np.ndarray
+
+
+def load_curve(run: RunFolder) -> Curve:
+    """:raises ValueError: if the run has no evaluations"""
+    path = run.path / "evaluations.npz"
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist: the run has not been evaluated yet")
+    args = run.args
+    with np.load(path) as evaluations:
+        return Curve(
+            f"{args['algo']}, seed {args['seed']}", args["env"], evaluations["timesteps"], evaluations["results"]
+        )
+
+
+def draw_curves(axes: Any, curves: Sequence[Curve]) -> None:
+    """
+    One line a run, the mean over the episodes of each evaluation; the episodes are the dots.
+
+    :param axes: of matplotlib
+    :param curves: of one environment
+    """
+    for curve in curves:
+        (line,) = axes.plot(curve.timesteps, curve.returns.mean(axis=1), label=curve.label)
+        steps = np.repeat(curve.timesteps, curve.returns.shape[1])
+        axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
+    episodes = ", ".join(sorted({str(curve.returns.shape[1]) for curve in curves}))
+    axes.set_title(curves[0].env_id, loc="left", fontweight="bold")
+    axes.set_xlabel("environment steps")
+    axes.set_ylabel(f"return of {episodes} mean-action episodes")
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    :param argv: arguments, those of the process by default
+    :return: 0
+    """
+    parser = Parser("Draw the learning curves of runs.")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs of one environment")
+    parser.add_argument("-o", "--output", type=Path, default=Path("curve.png"), help="file (.png, .svg, .pdf)")
+    args = parser.parse_args(argv)
+    try:
+        curves = [load_curve(RunFolder.open(run)) for run in args.runs]
+        if len({curve.env_id for curve in curves}) > 1:
+            raise ValueError("The runs must be of one environment; draw one figure for each")
+    except ValueError as error:
+        parser.fail(error)
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        parser.fail(ImportError('Plots need matplotlib: pip install "sb3-tdc[plot]"'))
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    draw_curves(figure.subplots(), curves)
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(args.output, dpi=150)
+    print(f"Wrote {args.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
