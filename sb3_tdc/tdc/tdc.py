@@ -18,6 +18,7 @@ from stable_baselines3.common.utils import get_parameters_by_name, update_learni
 
 from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
 from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
+from sb3_tdc.tdc.fused import FusedUpdate, obstacles
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     mean_and_std,
@@ -72,6 +73,8 @@ class TDC(OffPolicyAlgorithm):
     :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` from 0.1 on,
         a number fixes it
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
+    :param fused: the same update on static buffers, about half as long: None where it applies (plain ReLU networks,
+        flat observations, Adam, on the CPU), True to demand it, False for none
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
@@ -117,6 +120,7 @@ class TDC(OffPolicyAlgorithm):
         target_noise_clip: float = 0.5,
         ent_coef: str | float = "auto",
         target_entropy: str | float = "auto",
+        fused: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -163,6 +167,7 @@ class TDC(OffPolicyAlgorithm):
         self.target_noise_clip = target_noise_clip
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
+        self.fused = fused
 
         if _init_setup_model:
             self._setup_model()
@@ -237,6 +242,7 @@ class TDC(OffPolicyAlgorithm):
             for networks in ((self.critic, self.actor), (self.critic_target, self.actor_target))
         )
         self._diagnostics = Diagnostics()
+        self._setup_fused_update()
         if self.stochastic_actor:
             self._setup_temperature()
 
@@ -249,6 +255,15 @@ class TDC(OffPolicyAlgorithm):
             assert shape is not None
             noise = NormalActionNoise(np.zeros(shape), np.full(shape, float(noise)))
         self.action_noise = noise
+
+    def _setup_fused_update(self) -> None:
+        self._fused_update: FusedUpdate | None = None
+        self._obstacles = obstacles(self)
+        if self.fused and self._obstacles:
+            raise ValueError(f"fused must be None or False here: {'; '.join(self._obstacles)}")
+        if self.verbose > 0 and self.fused is None:
+            reason = f" ({'; '.join(self._obstacles)})" if self._obstacles else ""
+            print(f"Using the {'readable' if reason else 'fused'} update{reason}")
 
     def _setup_temperature(self) -> None:
         self._target_entropy = (
@@ -277,14 +292,15 @@ class TDC(OffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         lam = self._scheduled("lam")
         self._update_learning_rates()
+        update = self._bind_fused_update(batch_size) or self
 
         for _ in range(gradient_steps):
             self._n_updates += 1
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            self._update_critics(replay_data, lam)
+            update.update_critics(replay_data, lam)
             if self._n_updates % self.policy_delay == 0:
-                self._update_actor(replay_data)
-                self._update_targets()
+                update.update_actor(replay_data)
+                update.update_targets()
 
     def _update_learning_rates(self) -> None:
         learning_rate = self._scheduled("learning_rate")
@@ -292,6 +308,14 @@ class TDC(OffPolicyAlgorithm):
         update_learning_rate(self.critic.optimizer, self._scheduled("qf_learning_rate"))
         if self.stochastic_actor and self._learns_ent_coef:
             update_learning_rate(self.ent_coef_optimizer, learning_rate)
+
+    def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
+        """The same update on static buffers, where it applies; it is made anew when the parameters were replaced."""
+        if self.fused is False or (self.fused is None and self._obstacles):
+            self._fused_update = None
+        elif self._fused_update is None or not self._fused_update.fits(batch_size):
+            self._fused_update = FusedUpdate(self, batch_size)
+        return self._fused_update
 
     def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
         """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""
@@ -301,7 +325,8 @@ class TDC(OffPolicyAlgorithm):
         noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
         return noise.add_(self.actor_target(replay_data.next_observations)).clamp_(-1, 1)
 
-    def _update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
+    def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
+        """One step of the critics (Eq. 1–10)."""
         # n-step returns carry their own discounts
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
@@ -318,28 +343,41 @@ class TDC(OffPolicyAlgorithm):
         self.critic.optimizer.zero_grad()
         current_quantiles.backward(quantile_huber_gradient(current_quantiles, target_quantiles, self.kappa))
         self.critic.optimizer.step()
+        if self.diagnoses_critics:
+            self.diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, selected)
 
-        if self._n_updates % DIAGNOSTICS_INTERVAL == 1:
-            self._diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, selected)
-
-    def _update_actor(self, replay_data: ReplayBufferSamples) -> None:
-        diagnostics: dict[str, th.Tensor] = {}
+    def update_actor(self, replay_data: ReplayBufferSamples) -> None:
+        """One step of the actor (Eq. 11–13), then of the temperature."""
         if self.stochastic_actor:
             actions, log_prob = self.actor.action_log_prob(replay_data.observations)  # type: ignore[operator]
-            ent_coef = self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
+            ent_coef = self.current_ent_coef()
             q_values = self.critic.q1_forward(replay_data.observations, actions)  # Eq. 11
             actor_loss = (ent_coef * log_prob.unsqueeze(1) - q_values).mean()  # Eq. 13
-            log_prob = log_prob.detach()
-            diagnostics.update(entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
+            self._minimize(actor_loss, self.actor.optimizer)  # type: ignore[arg-type]
+            self.update_temperature(log_prob.detach(), ent_coef, actor_loss.detach())
         else:
             actions = self.actor(replay_data.observations)
             actor_loss = -self.critic.q1_forward(replay_data.observations, actions).mean()  # Eq. 11–12
-        self._minimize(actor_loss, self.actor.optimizer)  # type: ignore[arg-type]
-        if self.stochastic_actor and self._learns_ent_coef:
-            ent_coef_loss = -(self.log_ent_coef * (log_prob + self._target_entropy)).mean()  # Eq. 14
+            self._minimize(actor_loss, self.actor.optimizer)  # type: ignore[arg-type]
+            self.diagnose(actor_loss=actor_loss.detach())
+
+    def current_ent_coef(self) -> th.Tensor:
+        """:return: (1,), α"""
+        return self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
+
+    def update_temperature(self, log_prob: th.Tensor, ent_coef: th.Tensor, actor_loss: th.Tensor) -> None:
+        """
+        One step of the temperature, if it is learned (Eq. 14).
+
+        :param log_prob: (B,), of the actor's update
+        :param ent_coef: (1,), α of the actor's update
+        :param actor_loss: scalar, for the log
+        """
+        self.diagnose(actor_loss=actor_loss, entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
+        if self._learns_ent_coef:
+            ent_coef_loss = -(self.log_ent_coef * (log_prob + self._target_entropy)).mean()
             self._minimize(ent_coef_loss, self.ent_coef_optimizer)
-            diagnostics["ent_coef_loss"] = ent_coef_loss.detach()
-        self._diagnostics.add(self._n_updates, self.num_timesteps, {"actor_loss": actor_loss.detach(), **diagnostics})
+            self.diagnose(ent_coef_loss=ent_coef_loss.detach())
 
     @staticmethod
     def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
@@ -349,28 +387,36 @@ class TDC(OffPolicyAlgorithm):
         optimizer.step()
 
     @th.no_grad()
-    def _update_targets(self) -> None:
-        th._foreach_lerp_(self._target_parameters, self._online_parameters, self.tau)  # Eq. 16
+    def update_targets(self) -> None:
+        """Polyak averaging of critics and actor (Eq. 16)."""
+        th._foreach_lerp_(self._target_parameters, self._online_parameters, self.tau)
         for target, online in zip(self._target_statistics, self._online_statistics, strict=True):
             target.copy_(online)
 
     # ---------------------------------------------------------------- logging
 
-    def _diagnose_critics(
+    def diagnose(self, **values: th.Tensor) -> None:
+        """Take scalars of this update into the means of the log; nothing waits for the device."""
+        self._diagnostics.add(self._n_updates, self.num_timesteps, values)
+
+    @property
+    def diagnoses_critics(self) -> bool:
+        """Whether this is an update at which the critics' diagnostics are taken."""
+        return self._n_updates % DIAGNOSTICS_INTERVAL == 1
+
+    def diagnose_critics(
         self, current: th.Tensor, target: th.Tensor, mean: th.Tensor, std: th.Tensor, selected: th.Tensor
     ) -> None:
         """Shapes (B, C, N), (B, N), (B, C), (B, C), (B,); each figure is described in docs/tdc.md."""
         td_errors = target.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
-        values = {
-            "critic_loss": quantile_huber_loss(current, target, self.kappa),  # Eq. 10
-            "target_mean": target.mean(),
-            "target_std": std.gather(1, selected.unsqueeze(1)).mean(),
-            "critic_disagreement": (mean.amax(dim=1) - mean.amin(dim=1)).mean(),
-            "td_error_var": td_errors.var(dim=0, correction=0).mean(),
-        }
-        for i in range(mean.shape[1]):
-            values[f"critic_{i + 1}_selected"] = (selected == i).float().mean()
-        self._diagnostics.add(self._n_updates, self.num_timesteps, values)
+        self.diagnose(
+            critic_loss=quantile_huber_loss(current, target, self.kappa),  # Eq. 10
+            target_mean=target.mean(),
+            target_std=std.gather(1, selected.unsqueeze(1)).mean(),
+            critic_disagreement=(mean.amax(dim=1) - mean.amin(dim=1)).mean(),
+            td_error_var=td_errors.var(dim=0, correction=0).mean(),
+            **{f"critic_{i + 1}_selected": (selected == i).float().mean() for i in range(mean.shape[1])},
+        )
 
     def dump_logs(self) -> None:
         """Write log data; what was measured in training since the last time is fetched from the device here."""
@@ -437,8 +483,8 @@ class TDC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_online_parameters", "_target_parameters", "_online_statistics", "_target_statistics"]
-        return [*super()._excluded_save_params(), *networks, *derived, "_diagnostics"]
+        derived = ["_obstacles", "_online_parameters", "_target_parameters", "_online_statistics", "_target_statistics"]
+        return [*super()._excluded_save_params(), *networks, *derived, "_diagnostics", "_fused_update"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]

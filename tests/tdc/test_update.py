@@ -103,13 +103,15 @@ def reference_actor_weights(networks):
     return [t.detach() for part in parts for pair in (part if isinstance(part, list) else [part]) for t in pair]
 
 
+@pytest.mark.parametrize("fused", [False, True], ids=["readable", "fused"])
 @pytest.mark.parametrize("stochastic", [False, True], ids=["deterministic", "stochastic"])
 @pytest.mark.parametrize(("n_critics", "lam", "kappa"), [(2, 0.9, 1.0), (2, 0.0, 0.0), (1, 1.0, 0.3), (3, 0.5, 10.0)])
-def test_updates_equal_algorithm_1(monkeypatch, stochastic, n_critics, lam, kappa):
+def test_updates_equal_algorithm_1(monkeypatch, stochastic, fused, n_critics, lam, kappa):
     """Five updates (two of them delayed): every weight, every target weight, and the temperature."""
     settings = {"lam": lam, "kappa": kappa, "gamma": 0.97, "tau": 0.05}
     model = make_model(
         stochastic_actor=stochastic,
+        fused=fused,
         learning_rate=1e-2,
         qf_learning_rate=2e-2,
         policy_delay=2,
@@ -130,6 +132,7 @@ def test_updates_equal_algorithm_1(monkeypatch, stochastic, n_critics, lam, kapp
         noises.append(noise.double())
         return noise
 
+    monkeypatch.setattr(th.Tensor, "normal_", lambda tensor: tensor.copy_(draw(tensor.shape)))
     monkeypatch.setattr(th, "randn_like", lambda tensor: draw(tensor.shape))
     monkeypatch.setattr(
         th.distributions.Normal, "rsample", lambda self, shape=(): self.loc + self.scale * draw(self.loc.shape)
@@ -162,9 +165,10 @@ def snapshot(model):
     return state
 
 
+@pytest.mark.parametrize("fused", [False, True], ids=["readable", "fused"])
 @pytest.mark.parametrize("stochastic", [False, True], ids=["deterministic", "stochastic"])
-def test_delay_moves_actor_and_targets_only_every_third_update(stochastic):
-    model = make_model(stochastic_actor=stochastic, policy_delay=3)
+def test_delay_moves_actor_and_targets_only_every_third_update(stochastic, fused):
+    model = make_model(stochastic_actor=stochastic, policy_delay=3, fused=fused)
     model.replay_buffer = BatchQueue(random_batches(6))
     for update in range(1, 7):
         before = snapshot(model)
@@ -176,7 +180,7 @@ def test_delay_moves_actor_and_targets_only_every_third_update(stochastic):
 
 
 def test_actor_step_leaves_no_gradient_in_the_critics():
-    model = make_model(policy_delay=1)
+    model = make_model(policy_delay=1, fused=False)
     model.replay_buffer = BatchQueue(random_batches(2))
     gradients = []
     step = model.actor.optimizer.step
