@@ -9,10 +9,12 @@ Shapes: C critics, B transitions, N quantiles, D observation, A action.
 """
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import FlattenExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
@@ -129,7 +131,8 @@ class Layer:
 
     def __init__(self, weight: th.Tensor, bias: th.Tensor):
         self.weight, self.bias = weight, bias
-        self.affine, self.matmul = (th.baddbmm, th.bmm) if weight.ndim == 3 else (th.addmm, th.mm)
+        self.affine: Any = th.baddbmm if weight.ndim == 3 else th.addmm
+        self.matmul: Any = th.bmm if weight.ndim == 3 else th.mm
 
     def first(self) -> "Layer":
         """:return: the layer of the first critic alone"""
@@ -272,7 +275,7 @@ class FusedUpdate:
         self.critic_adam = FlatAdam(model.critic.optimizer, list(model.critic_target.parameters()))
         self.actor_adam = FlatAdam(model.actor.optimizer, list(model.actor_target.parameters()))  # type: ignore[arg-type]
         obs_dim = model.policy.actor.features_dim
-        action_dim = model.critic.layers[0].weight.shape[1] - obs_dim
+        action_dim = get_action_dim(model.critic.action_space)
 
         def empty(*shape: int) -> th.Tensor:
             return th.empty(batch_size, *shape)
@@ -300,6 +303,7 @@ class FusedUpdate:
         self.action_weight = online[0].weight[0, obs_dim:]  # (A, out)
 
         online, target, self.actor_gradient = self._networks(self.actor_adam)
+        self.mean_layers = online[:-1] if model.stochastic_actor else online
         make_head = TanhGaussianHead if model.stochastic_actor else DeterministicHead
         self.head, self.target_head = make_head(online, self.observations), make_head(target, self.next_observations)
 
@@ -312,6 +316,17 @@ class FusedUpdate:
         """:return: whether the buffers are of this size, and the model's parameters still those of here"""
         adams = (self.critic_adam, self.actor_adam)
         return batch_size == self.batch_size and all(adam.owns_parameters() for adam in adams)
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """
+        :param observations: (n, D)
+        :return: (n, A), the mean actions in [-1, 1]
+        """
+        hidden = th.from_numpy(np.asarray(observations, dtype=np.float32))
+        *hidden_layers, output = self.mean_layers
+        for layer in hidden_layers:
+            hidden = th.addmm(layer.bias, hidden, layer.weight).relu_()
+        return th.addmm(output.bias, hidden, output.weight).tanh_().numpy()
 
     def _set_target_actions(self, replay_data: ReplayBufferSamples) -> None:
         self.next_observations.copy_(replay_data.next_observations)

@@ -209,6 +209,11 @@ class TDCPolicy(TD3Policy):
         data.update(n_quantiles=self.n_quantiles, stochastic_actor=self.stochastic_actor)
         return data
 
+    def set_training_mode(self, mode: bool) -> None:
+        # SB3 calls this at every step; walking through the modules costs more than the actor
+        if any(module.training != mode for module in (self, self.actor, self.critic)):
+            super().set_training_mode(mode)
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         # The mean action for both heads, whatever `deterministic` says (Eq. 15 and 19)
         return self.actor._predict(observation, deterministic=True)

@@ -148,16 +148,8 @@ def quantile_huber_gradient(current: th.Tensor, target: th.Tensor, kappa: float 
     _check_shapes(current, target)
     rows, target_rows = _rows(current.detach(), target.detach())
     scale = 1 / (current.shape[0] * current.shape[2] * target.shape[1])
-    gradient = RowGradient(*rows.shape, target.shape[1], scale, rows)
+    gradient = RowGradient(len(rows), rows.shape[1], target.shape[1], scale, rows)
     return gradient(rows, target_rows, kappa).view(current.shape)
-
-
-def _huber(distance: th.Tensor, kappa: float) -> th.Tensor:
-    """L_κ of distances ≥ 0, in place: c·(δ − c/2) with c = min(δ, κ); for κ = 0 the distance itself."""
-    if kappa == 0:
-        return distance
-    clamped = distance.clamp(max=kappa)
-    return distance.sub_(clamped, alpha=0.5).mul_(clamped)
 
 
 class _QuantileHuberLoss(th.autograd.Function):
@@ -166,11 +158,19 @@ class _QuantileHuberLoss(th.autograd.Function):
         ctx.save_for_backward(current, target)
         ctx.kappa = kappa
         rows, target_rows = _rows(current, target)
-        sum_below, sum_above = th.empty_like(rows), th.empty_like(rows)
-        for chunk in _row_chunks(len(rows), rows.shape[1] * target.shape[1]):
-            delta = target_rows[chunk, None, :] - rows[chunk, :, None]  # Eq. 8
-            th.sum(_huber(delta.clamp(min=0), kappa), dim=-1, out=sum_above[chunk])
-            th.sum(_huber(delta.neg_().clamp_(min=0), kappa), dim=-1, out=sum_below[chunk])
+        sums = th.empty_like(rows), th.empty_like(rows)
+        chunks = _row_chunks(len(rows), rows.shape[1] * target.shape[1])
+        # Buffers that are kept: fresh ones of this size cost more than the arithmetic
+        distance, clamped = (rows.new_empty(chunks[0].stop, rows.shape[1], target.shape[1]) for _ in range(2))
+        for chunk in chunks:
+            y, z = target_rows[chunk, None, :], rows[chunk, :, None]
+            for near, far, total in ((z, y, sums[0]), (y, z, sums[1])):
+                d = th.sub(far, near, out=distance[: len(z)]).clamp_(min=0)  # Eq. 8: |δ| above, then below
+                if kappa > 0:  # L_κ = c·(|δ| − c/2) with c = min(|δ|, κ)
+                    c = th.clamp(d, max=kappa, out=clamped[: len(z)])
+                    d.sub_(c, alpha=0.5).mul_(c)
+                th.sum(d, dim=-1, out=total[chunk])
+        sum_above, sum_below = sums
         levels = quantile_midpoints(current.shape[2], current.device).to(current.dtype)
         # Eq. 9: |τ_k − 1{δ<0}| is τ_k above and 1 − τ_k below. Eq. 10: mean over pairs and batch, sum over critics
         pairs = (levels * sum_above + (1 - levels) * sum_below).mean() / target.shape[1]
