@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments
 from sb3_tdc.experiment import ALGORITHMS, check_env_id, make_envs
 from sb3_tdc.hyperparams import Hyperparams, parse
-from sb3_tdc.rendering import VideoWriter, choose_gl_backend, has_display
+from sb3_tdc.rendering import VideoWriter, choose_gl_backend, follow_agent, has_display
 from sb3_tdc.run_folder import RunFolder
 
 
@@ -165,6 +165,8 @@ def _run(args: argparse.Namespace) -> int:
             training=False,
         )
         stack.callback(env.close)
+        for unwrapped in env.get_attr("unwrapped"):
+            follow_agent(unwrapped)
         model = ALGORITHMS[trained.algo].load(trained.path, env=env, device=args.device, buffer_size=1)
         env.seed(args.seed)  # loading has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")

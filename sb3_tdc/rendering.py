@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 _GL_BACKENDS = ("egl", "osmesa")
@@ -42,6 +43,21 @@ def choose_gl_backend() -> str:
         "MuJoCo cannot render: there is no display, and neither EGL nor OSMesa works. "
         "On Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 (or libosmesa6)"
     )
+
+
+def follow_agent(env: gym.Env) -> None:
+    """Let MuJoCo's pictures follow the agent, unless the environment was given a camera (-v4 tasks lose it)."""
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    if renderer is None or renderer.camera_id not in (None, -1):
+        return
+    import mujoco
+
+    # Frames are taken from a camera of the model, a window from the camera that the configuration describes
+    renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    torso = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_BODY, "torso")
+    if torso != -1:
+        tracking = {"type": int(mujoco.mjtCamera.mjCAMERA_TRACKING), "trackbodyid": torso}
+        renderer.default_cam_config = {**tracking, **(renderer.default_cam_config or {})}
 
 
 class VideoWriter:
