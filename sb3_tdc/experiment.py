@@ -35,6 +35,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.interruption import StopOnSignal, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, save_model
 from sb3_tdc.tdc import TDC
@@ -128,6 +129,8 @@ def make_envs(
     """
 
     def wrap(env: gym.Env) -> gym.Env:
+        if vec_env == "subproc":
+            ignore_interrupts()
         for wrapper in hyperparams.env_wrapper:
             env = wrapper(env)
         return env
@@ -158,7 +161,7 @@ def make_envs(
 
 def train(experiment: Experiment) -> Outcome:
     """
-    Train from the first step to the last, or to Ctrl-C; either way the model is saved.
+    Train from the first step to the last, or to Ctrl-C; either way the model is saved (after a second one, it is not).
 
     :raises SetupError: if the run cannot begin; its folder is removed
     :raises NonFiniteError: if training diverged; saved models stay as they are
@@ -175,22 +178,19 @@ def train(experiment: Experiment) -> Outcome:
                 eval_env = model._wrap_env(eval_env, verbose=0, monitor_wrapper=False)
             progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
             callbacks = [*_make_callbacks(experiment, eval_env, progress), progress]
-        except _SETUP_ERRORS as error:
+        except (*_SETUP_ERRORS, KeyboardInterrupt) as error:
             stack.close()
             shutil.rmtree(experiment.folder.path)
-            raise SetupError(" ".join(str(error).split()) or repr(error)) from error
+            raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
         stack.callback(progress.close)
-        interrupted = False
-        try:
+        with StopOnSignal() as stop:
             model.learn(
                 experiment.hyperparams.n_timesteps,
-                callback=callbacks,
+                callback=[*callbacks, stop],
                 log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
             )
-        except KeyboardInterrupt:
-            interrupted = True
-        _save(experiment, model)
-        return Outcome(model, interrupted)
+            _save(experiment, model)
+        return Outcome(model, interrupted=stop.requested)
 
 
 def _make_training_envs(experiment: Experiment) -> VecEnv:
@@ -309,10 +309,16 @@ def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
 
 @contextmanager
 def _closing(env: VecEnv) -> Iterator[VecEnv]:
-    yield env
-    # Ctrl-C may have reached the processes of the environments before
-    with suppress(BrokenPipeError, ConnectionResetError, EOFError):
-        env.close()
+    try:
+        yield env
+    except KeyboardInterrupt:  # perhaps in the middle of a step: a process could be waited for in vain
+        for process in getattr(env.unwrapped, "processes", []):
+            process.kill()
+        raise
+    finally:
+        # A process that died on its own cannot be told to close
+        with suppress(BrokenPipeError, ConnectionResetError, EOFError):
+            env.close()
 
 
 class _SaveNormalization(BaseCallback):

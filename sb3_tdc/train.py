@@ -1,14 +1,12 @@
 """``python train.py --algo tdc --env Walker2d-v4``: arguments and messages; the run itself is in ``experiment``."""
 
 import argparse
-import signal
 import sys
 import textwrap
 import time
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
 import yaml
@@ -124,10 +122,6 @@ def _has_tqdm(verbose: int) -> bool:
     return True
 
 
-def _terminate(*_: Any) -> NoReturn:
-    raise KeyboardInterrupt  # a polite kill is a Ctrl-C
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: arguments, those of the process by default
@@ -135,7 +129,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = make_parser()
     args = parser.parse_args(argv)
-    signal.signal(signal.SIGTERM, _terminate)
     start = time.monotonic()
     try:
         experiment = make_experiment(args)
@@ -143,6 +136,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.verbose > 0:
             print(f"Training {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
         outcome = train(experiment)
+    except KeyboardInterrupt:
+        print("Stopped without saving; what was saved before is still there.", file=sys.stderr)
+        return 130
     except NonFiniteError as error:
         print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)
         return 1

@@ -15,6 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_tdc import TDC, enjoy, train
 from sb3_tdc.arguments import Parser
+from sb3_tdc.interruption import StopOnSignal
 from sb3_tdc.run_folder import RunFolder
 
 ROOT = Path(__file__).parent.parent
@@ -211,6 +212,17 @@ def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
     assert (
         f"python train.py --algo tdc --env Hopper-v4 -n {1_000_000 - TDC.load(model).num_timesteps} -i {model}" in out
     )
+
+
+def test_a_second_signal_interrupts_and_handlers_are_put_back():
+    before = signal.getsignal(signal.SIGINT)
+    with StopOnSignal() as stop:
+        assert stop._on_step()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert not stop._on_step()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):

@@ -1,0 +1,49 @@
+"""Ctrl-C and a polite kill: training ends after the step under way, with everything consistent."""
+
+import signal
+import sys
+import threading
+from types import FrameType, TracebackType
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopOnSignal(BaseCallback):
+    """
+    As a context, it takes SIGINT and SIGTERM; as a callback, it ends training after one. A second one interrupts.
+
+    An exception raised by a handler, anywhere, could leave a step of processes half received or a file half written.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.requested = False
+
+    def __enter__(self) -> "StopOnSignal":
+        if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
+            self.previous = {number: signal.signal(number, self._handle) for number in _SIGNALS}
+        else:
+            self.previous = {}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        print("\nStopping after this step; once more to stop without saving.", file=sys.stderr, flush=True)
+
+    def _on_step(self) -> bool:
+        return not self.requested
+
+
+def ignore_interrupts() -> None:
+    """For processes of environments: a Ctrl-C in the terminal reaches them too, but the trainer ends them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
