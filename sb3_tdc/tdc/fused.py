@@ -23,7 +23,7 @@ from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import nn
 
 from sb3_tdc.tdc.policies import QuantileCritic
-from sb3_tdc.tdc.quantiles import RowGradient
+from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 
 if TYPE_CHECKING:
     from sb3_tdc.tdc.tdc import TDC
@@ -152,15 +152,24 @@ class Mlp:
     :param layers: of the network
     :param inputs: (B, in), filled before each pass
     :param activate_output: whether there is a ReLU behind the last layer too
+    :param outputs: buffers for the outputs of the layers
+    :param slopes: buffers for the slopes there; those of passes that are over by then keep the cache small
     """
 
-    def __init__(self, layers: list[Layer], inputs: th.Tensor, activate_output: bool = False):
+    def __init__(
+        self,
+        layers: list[Layer],
+        inputs: th.Tensor,
+        activate_output: bool = False,
+        outputs: list[th.Tensor] | None = None,
+        slopes: list[th.Tensor] | None = None,
+    ):
         self.layers, self.activate_output = layers, activate_output
         stacked = layers[0].weight.shape[:-2]
-        self.activations = [inputs.expand(*stacked, -1, -1)]
-        for layer in layers:
-            self.activations.append(inputs.new_empty(*stacked, len(inputs), layer.bias.shape[-1]))
-        self.slopes = [th.empty_like(activation) for activation in self.activations[1:]]
+        if outputs is None:
+            outputs = [inputs.new_empty(*stacked, len(inputs), layer.bias.shape[-1]) for layer in layers]
+        self.activations = [inputs.expand(*stacked, -1, -1), *outputs]
+        self.slopes = [th.empty_like(output) for output in outputs] if slopes is None else slopes
 
     def forward(self) -> th.Tensor:
         """:return: (B, out) or (C, B, out), overwritten by the next pass"""
@@ -287,19 +296,22 @@ class FusedUpdate:
         self.noise = empty(action_dim)
 
         online, target, gradient = self._networks(self.critic_adam)
-        self.critic, self.critic_target, self.critic_gradient = Mlp(online, inputs), Mlp(target, next_inputs), gradient
+        self.critic_gradient = gradient
+        self.critic_target = Mlp(target, next_inputs)
+        self.critic = Mlp(online, inputs, slopes=self.critic_target.activations[1:])
         n_critics, n_quantiles = model.critic.n_critics, model.critic.n_quantiles
-        self.row_gradient = RowGradient(
-            n_critics * batch_size, n_quantiles, n_quantiles, 1 / (batch_size * n_quantiles**2), inputs
-        )
-        self.rows = th.arange(batch_size)
+        self.loss_gradient = QuantileHuberGradient(self.critic.activations[-1], n_quantiles)
         self.mean, self.std = th.empty(n_critics, batch_size), th.empty(n_critics, batch_size)
         self.centred = th.empty(n_critics, batch_size, n_quantiles)
         self.target = empty(n_quantiles)
 
         # Q₁: the hidden layers of the first critic, then the mean of its quantiles folded into the last layer
         *hidden, self.quantile_layer = (layer.first() for layer in online)
-        self.value = Mlp(hidden, inputs, activate_output=True)
+        outputs, slopes = (
+            [buffer[0] for buffer in buffers[: len(hidden)]]
+            for buffers in (self.critic.activations[1:], self.critic.slopes)
+        )
+        self.value = Mlp(hidden, inputs, activate_output=True, outputs=outputs, slopes=slopes)
         self.action_weight = online[0].weight[0, obs_dim:]  # (A, out)
 
         online, target, self.actor_gradient = self._networks(self.actor_adam)
@@ -346,21 +358,28 @@ class FusedUpdate:
         th.mean(quantiles, dim=-1, out=self.mean)  # Eq. 4
         th.sub(quantiles, self.mean.unsqueeze(-1), out=self.centred)
         th.linalg.vector_norm(self.centred, dim=-1, out=self.std).div_(math.sqrt(quantiles.shape[-1]))
-        selected = (self.mean - lam * self.std).argmin(dim=0)  # Eq. 5
-        rows = selected.mul(self.batch_size).add_(self.rows)
-        th.index_select(quantiles.flatten(0, 1), 0, rows, out=self.target)  # Eq. 6
+        self._select(quantiles, self.mean - lam * self.std)
         discounts = replay_data.discounts if replay_data.discounts is not None else model.gamma
         self.target.mul_((1 - replay_data.dones) * discounts).add_(replay_data.rewards)  # Eq. 7
 
         self.observations.copy_(replay_data.observations)
         self.actions.copy_(replay_data.actions)
         current = self.critic.forward()
-        target_rows = self.target.expand(len(current), -1, -1).flatten(0, 1)
-        slope = self.row_gradient(current.flatten(0, 1), target_rows, model.kappa)  # Eq. 8–10
-        self.critic.backward(slope.view_as(current), self.critic_gradient)
+        slope = self.loss_gradient(current, self.target, model.kappa)  # Eq. 8–10
+        self.critic.backward(slope, self.critic_gradient)
         self.critic_adam.step()
         if model.diagnoses_critics:
-            model.diagnose_critics(current.transpose(0, 1), self.target, self.mean.T, self.std.T, selected)
+            model.diagnose_critics(current.transpose(0, 1), self.target, self.mean.T, self.std.T, lam)
+
+    def _select(self, quantiles: th.Tensor, score: th.Tensor) -> None:
+        """Eq. 5–6: the quantiles of the critic with the smallest score; of equal ones, of the first."""
+        best, target = score[0], quantiles[0]
+        for critic in range(1, len(score)):
+            smaller = score[critic] < best
+            th.where(smaller.unsqueeze(1), quantiles[critic], target, out=self.target)
+            best, target = th.minimum(score[critic], best), self.target
+        if len(score) == 1:
+            self.target.copy_(target)
 
     def _value_and_slope(self) -> tuple[th.Tensor, th.Tensor]:
         """Q₁ (Eq. 11) of the actions in the inputs, (B,), and the slope of −mean Q₁ at these actions, (B, A)."""

@@ -346,7 +346,7 @@ class TDC(OffPolicyAlgorithm):
         current_quantiles.backward(quantile_huber_gradient(current_quantiles, target_quantiles, self.kappa))
         self.critic.optimizer.step()
         if self.diagnoses_critics:
-            self.diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, selected)
+            self.diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, lam)
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
         """One step of the actor (Eq. 11–13), then of the temperature."""
@@ -407,9 +407,10 @@ class TDC(OffPolicyAlgorithm):
         return self._n_updates % DIAGNOSTICS_INTERVAL == 1
 
     def diagnose_critics(
-        self, current: th.Tensor, target: th.Tensor, mean: th.Tensor, std: th.Tensor, selected: th.Tensor
+        self, current: th.Tensor, target: th.Tensor, mean: th.Tensor, std: th.Tensor, lam: float
     ) -> None:
-        """Shapes (B, C, N), (B, N), (B, C), (B, C), (B,); each figure is described in docs/tdc.md."""
+        """Shapes (B, C, N), (B, N), (B, C), (B, C); each figure is described in docs/tdc.md."""
+        selected = select_critic(mean, std, lam)
         td_errors = target.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
         self.diagnose(
             critic_loss=quantile_huber_loss(current, target, self.kappa),  # Eq. 10

@@ -334,7 +334,7 @@ def test_diagnostics_by_hand():
     current = th.tensor([[[0.0, 2.0], [4.0, 4.0]], [[1.0, 1.0], [0.0, 6.0]]])  # (B, C, N)
     target = th.tensor([[1.0, 3.0], [0.0, 0.0]])
     mean, std = th.tensor([[1.0, 4.0], [5.0, 2.0]]), th.tensor([[0.5, 9.0], [9.0, 0.7]])
-    model.diagnose_critics(current, target, mean, std, th.tensor([0, 1]))
+    model.diagnose_critics(current, target, mean, std, lam=0.0)  # selects 1, then 2
     means = model._diagnostics.fetch()
     assert means["target_mean"] == pytest.approx(1.0)
     assert means["target_std"] == pytest.approx(0.6)  # of the selected: 0.5 and 0.7
