@@ -1,0 +1,264 @@
+"""
+``python -m benchmarks.speed``: whole environment steps of TDC and its peers, side by side.
+
+Every row is a ratio of times measured in one process, in turn, a few dozen steps each: the machine may drift, the
+ratio does not follow. Peers: ``pip install "sb3-tdc[bench]"``; one that is missing is left out, and said so.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ENVS = ("HalfCheetah-v4", "Hopper-v4", "Humanoid-v4")
+# What is asked of TDC, as time of the peer / time of TDC, on HalfCheetah-v4: (peer, threads) → at least
+TARGETS = {
+    ("SB3 TD3", 2): 1.4,
+    ("SB3 TD3", 1): 1.15,
+    ("contrib TQC, 64 quantiles", 2): 9.0,
+    ("SBX TQC, 64 quantiles", 2): 4.8,
+    ("SBX TD3", 2): 1.0,
+    ("naive transcription", 2): 6.5,
+    ("TDC, readable update", 2): None,
+}
+
+
+def make_models(env_id: str) -> dict[str, Any]:
+    """:return: a model for every peer that is installed, by name; ``TDC`` is the one the others are compared with"""
+    import gymnasium as gym
+    from stable_baselines3 import SAC, TD3
+    from stable_baselines3.common.noise import NormalActionNoise
+
+    from benchmarks.naive import NaivePolicy, NaiveTDC
+    from sb3_tdc import TDC
+
+    dimension = gym.make(env_id).action_space.shape[0]
+    noise = NormalActionNoise(np.zeros(dimension), np.full(dimension, 0.1))
+
+    def settings(**policy_kwargs: Any) -> dict[str, Any]:
+        common = {"learning_starts": 300, "buffer_size": 50_000, "batch_size": 256, "seed": 0}
+        return {
+            **common,
+            "env": env_id,
+            "policy": "MlpPolicy",
+            "policy_kwargs": {"net_arch": [256, 256], **policy_kwargs},
+        }
+
+    models = {
+        "TDC": TDC(**settings(), device="cpu"),
+        "TDC, readable update": TDC(**settings(), device="cpu", fused=False),
+        "TDC, stochastic head": TDC(**settings(), device="cpu", stochastic_actor=True),
+        "SB3 TD3": TD3(**settings(), device="cpu", action_noise=noise),
+        "SB3 SAC": SAC(**settings(), device="cpu"),
+        "naive transcription": NaiveTDC(**{**settings(), "policy": NaivePolicy}, device="cpu", action_noise=noise),
+    }
+    if contrib := _optional("sb3_contrib"):
+        models["contrib TQC, 64 quantiles"] = contrib.TQC(**settings(n_quantiles=64), device="cpu")
+    if sbx := _optional("sbx"):
+        models["SBX TD3"] = sbx.TD3(**settings(), action_noise=noise, policy_delay=2)
+        models["SBX TQC, 64 quantiles"] = sbx.TQC(**settings(n_quantiles=64))
+    return models
+
+
+def _optional(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        print(f'{name} is missing and left out: pip install "sb3-tdc[bench]"', file=sys.stderr)
+        return None
+
+
+def matrix_products(model: Any) -> Callable[[], None]:
+    """:return: a function that computes the matrix products of one gradient step, and nothing else"""
+    import torch as th
+
+    fused = model._fused_update
+    n_actions = fused.actions.shape[1]
+    slopes = th.randn_like(fused.critic.activations[-1]), th.randn_like(fused.value.activations[-1])
+    action_slope = th.randn(fused.batch_size, n_actions)
+    calls = 0
+
+    def forward(network: Any) -> None:
+        for i, layer in enumerate(network.layers):
+            layer.affine(layer.bias, network.activations[i], layer.weight, out=network.activations[i + 1])
+
+    def backward(network: Any, slope: Any, gradients: Any) -> Any:
+        for i in reversed(range(len(network.layers))):
+            if gradients is not None:
+                network.layers[i].matmul(network.activations[i].mT, slope, out=gradients[i].weight)
+            if i > 0:
+                slope = network.layers[i].matmul(slope, network.layers[i].weight.mT, out=network.slopes[i - 1])
+        return slope
+
+    def run() -> None:
+        nonlocal calls
+        calls += 1
+        forward(fused.target_head.network)
+        forward(fused.critic_target)
+        forward(fused.critic)
+        backward(fused.critic, slopes[0], fused.critic_gradient)
+        if calls % model.policy_delay == 0:
+            forward(fused.head.network)
+            forward(fused.value)
+            backward(fused.value, slopes[1], None) @ fused.action_weight.mT
+            backward(fused.head.network, action_slope, fused.actor_gradient)
+
+    return run
+
+
+class Load:
+    """Processor time that other processes take meanwhile, in cores (Linux)."""
+
+    def __enter__(self) -> "Load":
+        self.start = time.perf_counter(), self._busy(), sum(os.times()[:4])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        seconds, busy, own = time.perf_counter(), self._busy(), sum(os.times()[:4])
+        self.foreign = (busy - self.start[1] - (own - self.start[2])) / (seconds - self.start[0])
+
+    @staticmethod
+    def _busy() -> float:
+        stat = Path("/proc/stat")
+        if not stat.exists():
+            return float("nan")
+        user, nice, system, _, _, irq, softirq, steal, *_ = map(int, stat.read_text().split("\n")[0].split()[1:])
+        return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+def time_calls(functions: dict[str, Callable[[], Any]], rounds: int, calls: dict[str, int]) -> dict[str, list[float]]:
+    """:return: milliseconds per call, (rounds,) for every function; one after the other in every round"""
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(rounds):
+        for name, function in functions.items():
+            start = time.perf_counter()
+            for _ in range(calls[name]):
+                function()
+            times[name].append(1000 * (time.perf_counter() - start) / calls[name])
+    return times
+
+
+def measure_env(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
+    """Whole environment steps of every peer, then gradient steps of TDC beside its matrix products."""
+    models = make_models(env_id)
+    for model in models.values():
+        model.learn(420)
+    learn = {name: lambda model=model: model.learn(steps, reset_num_timesteps=False) for name, model in models.items()}
+    with Load() as load:
+        step_times = time_calls(learn, rounds, dict.fromkeys(learn, 1))
+        tdc = models["TDC"]
+        gradient = {"TDC": lambda: tdc.train(1, 256), "matrix products": matrix_products(tdc)}
+        gradient_times = time_calls(gradient, 4 * rounds, dict.fromkeys(gradient, 20))
+    return {
+        "steps": {name: [t / steps for t in times] for name, times in step_times.items()},
+        "gradient": gradient_times,
+        "foreign_load": load.foreign,
+    }
+
+
+def measure_scaling(rounds: int) -> dict[str, Any]:
+    """Gradient steps of TDC beside the matrix products, against quantiles, batch and width."""
+    from sb3_tdc import TDC
+
+    def measure(n_quantiles: int = 64, batch_size: int = 256, width: int = 256) -> dict[str, list[float]]:
+        model = TDC(
+            "MlpPolicy",
+            "HalfCheetah-v4",
+            policy_kwargs={"net_arch": [width, width], "n_quantiles": n_quantiles},
+            learning_starts=10_000,
+            buffer_size=10_000,
+            batch_size=batch_size,
+            device="cpu",
+            seed=0,
+        ).learn(300)
+        model.train(2, batch_size)
+        functions = {"TDC": lambda: model.train(1, batch_size), "matrix products": matrix_products(model)}
+        start = time.perf_counter()
+        model.train(2, batch_size)
+        calls = max(2, min(20, int(0.2 / (time.perf_counter() - start))))
+        return time_calls(functions, rounds, dict.fromkeys(functions, calls))
+
+    with Load() as load:
+        result: dict[str, Any] = {
+            "quantiles": {n: measure(n_quantiles=n) for n in (8, 16, 32, 64, 128, 200)},
+            "batch size": {n: measure(batch_size=n) for n in (64, 256, 1024, 4096)},
+            "width": {n: measure(width=n) for n in (64, 128, 256, 512, 1024)},
+        }
+    return {**result, "foreign_load": load.foreign}
+
+
+def run_child(task: str, threads: int, arguments: argparse.Namespace) -> dict[str, Any]:
+    """A process of its own for every measurement, on as many cores as threads."""
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {**os.environ, **dict.fromkeys(names, str(threads)), "JAX_PLATFORMS": "cpu", "TQDM_DISABLE": "1"}
+    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.speed", "--task", task, "--threads", str(threads)]
+    command += ["--rounds", str(arguments.rounds), "--steps", str(arguments.steps)]
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def work(arguments: argparse.Namespace) -> None:
+    """What a child does: pin itself, measure, print JSON."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.threads])
+    import torch as th
+
+    th.set_num_threads(arguments.threads)
+    if arguments.task == "scaling":
+        result = measure_scaling(arguments.rounds)
+    else:
+        result = measure_env(arguments.task, arguments.rounds, arguments.steps)
+    print(json.dumps(result))
+
+
+def hardware() -> str:
+    import torch as th
+
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        model = next((x.split(":")[1].strip() for x in cpuinfo.read_text().split("\n") if "model name" in x), model)
+    versions = f"Python {platform.python_version()}, PyTorch {th.__version__}"
+    return f"{os.cpu_count()} cores of {model}, {platform.system()}, {versions}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"), help="folder of table and plots")
+    parser.add_argument("--rounds", type=int, default=12, help="turns of every peer")
+    parser.add_argument("--steps", type=int, default=30, help="environment steps a turn")
+    parser.add_argument("--envs", nargs="+", default=ENVS)
+    parser.add_argument("--task", help=argparse.SUPPRESS)
+    parser.add_argument("--threads", type=int, nargs="+", default=[2, 1])
+    arguments = parser.parse_args()
+    if arguments.task:
+        arguments.threads = arguments.threads[0]
+        work(arguments)
+        return
+
+    from benchmarks.report import write_report
+
+    start = time.perf_counter()
+    results: dict[str, Any] = {"hardware": hardware(), "rounds": arguments.rounds, "steps": arguments.steps, "envs": {}}
+    for env_id in arguments.envs:
+        for threads in arguments.threads:
+            print(f"{env_id}, {threads} thread(s) ...", file=sys.stderr, flush=True)
+            results["envs"].setdefault(env_id, {})[str(threads)] = run_child(env_id, threads, arguments)
+    for threads in arguments.threads:
+        print(f"scaling, {threads} thread(s) ...", file=sys.stderr, flush=True)
+        results.setdefault("scaling", {})[str(threads)] = run_child("scaling", threads, arguments)
+    results["minutes"] = (time.perf_counter() - start) / 60
+    write_report(results, arguments.output, TARGETS)
+
+
+if __name__ == "__main__":
+    main()
