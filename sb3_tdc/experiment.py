@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3 import DDPG, SAC, TD3
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_tdc.hyperparams import Hyperparams
-from sb3_tdc.interruption import StopOnSignal, ignore_interrupts
+from sb3_tdc.interruption import StopOnSignal, StoppableEvaluation, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, save_model
 from sb3_tdc.tdc import TDC
@@ -176,17 +176,17 @@ def train(experiment: Experiment) -> Outcome:
             if experiment.eval_freq > 0:
                 eval_env = stack.enter_context(_closing(_make_eval_envs(experiment)))
                 eval_env = model._wrap_env(eval_env, verbose=0, monitor_wrapper=False)
-            progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
-            callbacks = [*_make_callbacks(experiment, eval_env, progress), progress]
+            stop, progress = StopOnSignal(), ProgressCallback(experiment.progress_bar, experiment.verbose)
+            callbacks = [*_make_callbacks(experiment, eval_env, progress, stop), progress, stop]
         except (*_SETUP_ERRORS, KeyboardInterrupt) as error:
             stack.close()
             shutil.rmtree(experiment.folder.path)
             raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
         stack.callback(progress.close)
-        with StopOnSignal() as stop:
+        with stop:
             model.learn(
                 experiment.hyperparams.n_timesteps,
-                callback=[*callbacks, stop],
+                callback=callbacks,
                 log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
             )
             _save(experiment, model)
@@ -264,7 +264,9 @@ def _make_logger(experiment: Experiment) -> Logger:
     return Logger(str(folder), writers)
 
 
-def _make_callbacks(experiment: Experiment, eval_env: VecEnv | None, progress: ProgressCallback) -> list[BaseCallback]:
+def _make_callbacks(
+    experiment: Experiment, eval_env: VecEnv | None, progress: ProgressCallback, stop: StopOnSignal
+) -> list[BaseCallback]:
     hyperparams, folder = experiment.hyperparams, experiment.folder
     callbacks = [*(make() for make in hyperparams.callbacks), _HParamsCallback(experiment)]
 
@@ -282,8 +284,9 @@ def _make_callbacks(experiment: Experiment, eval_env: VecEnv | None, progress: P
         )
     if eval_env is not None:
         callbacks.append(
-            EvalCallback(
+            StoppableEvaluation(
                 eval_env,
+                stop,
                 callback_on_new_best=_SaveNormalization(folder.normalization(folder.best_model)),
                 callback_after_eval=progress.evaluation,
                 n_eval_episodes=experiment.eval_episodes,

@@ -4,8 +4,10 @@ import signal
 import sys
 import threading
 from types import FrameType, TracebackType
+from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -42,6 +44,29 @@ class StopOnSignal(BaseCallback):
 
     def _on_step(self) -> bool:
         return not self.requested
+
+
+class StoppableEvaluation(EvalCallback):
+    """An ``EvalCallback`` that a signal ends between two steps, also where an episode would never end."""
+
+    def __init__(self, eval_env: VecEnv, stop: StopOnSignal, **kwargs: Any):
+        super().__init__(eval_env, **kwargs)
+        self.stop = stop
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        if self.stop.requested:
+            raise _EvaluationStoppedError
+        super()._log_success_callback(locals_, globals_)
+
+    def _on_step(self) -> bool:
+        try:
+            return super()._on_step()
+        except _EvaluationStoppedError:
+            return False
+
+
+class _EvaluationStoppedError(Exception):
+    """Never leaves this module."""
 
 
 def ignore_interrupts() -> None:
