@@ -74,12 +74,17 @@ def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:
     parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the environment")
 
 
-def apply_common_arguments(args: argparse.Namespace) -> None:
+def apply_common_arguments(args: argparse.Namespace, env_id: str) -> str:
     """
     Import the packages that register environments, and set the number of threads.
 
+    :param env_id: perhaps with its package, as in "package:Env-v0", which is then one of the packages
+    :return: the environment's id alone
     :raises ValueError: for a package that is not installed, with the command that installs it
     """
+    package, _, env_id = env_id.rpartition(":")
+    if package:
+        args.gym_packages = [*args.gym_packages, package]
     for package in args.gym_packages:
         try:
             importlib.import_module(package)
@@ -89,3 +94,4 @@ def apply_common_arguments(args: argparse.Namespace) -> None:
             ) from error
     if args.num_threads > 0:
         th.set_num_threads(args.num_threads)
+    return env_id

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments
-from sb3_tdc.experiment import ALGORITHMS, check_env_id, make_envs
+from sb3_tdc.experiment import ALGORITHMS, check_env_id, check_saved_by, make_envs
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.rendering import VideoWriter, choose_gl_backend, follow_agent, has_display
 from sb3_tdc.run_folder import RunFolder
@@ -93,13 +93,19 @@ def find_trained(args: argparse.Namespace) -> Trained:
     :raises ValueError: if there is none
     """
     if args.run is not None and args.run.is_file():
-        apply_common_arguments(args)
-        hyperparams = parse({"n_timesteps": 1}, ALGORITHMS[args.algo], str(args.run))
-        return Trained(args.run, args.algo, args.env, hyperparams)
-    run = find_run(args)
-    path, trained = find_model(args, run), run.args
+        path = args.run
+        try:
+            run = RunFolder.open(path.parent)  # what lies beside it counts
+        except ValueError:
+            env_id = apply_common_arguments(args, args.env)
+            hyperparams = parse({"n_timesteps": 1}, ALGORITHMS[args.algo], str(path))
+            return Trained(path, args.algo, env_id, hyperparams)
+    else:
+        run = find_run(args)
+        path = find_model(args, run)
+    trained = run.args
     args.gym_packages = [*trained["gym_packages"], *args.gym_packages]
-    apply_common_arguments(args)
+    apply_common_arguments(args, trained["env"])
     hyperparams = parse(run.config, ALGORITHMS[trained["algo"]], str(run.path / run.env_name / "config.yml"))
     normalization = None
     if hyperparams.normalize is not None:
@@ -167,6 +173,7 @@ def _run(args: argparse.Namespace) -> int:
         stack.callback(env.close)
         for unwrapped in env.get_attr("unwrapped"):
             follow_agent(unwrapped)
+        check_saved_by(trained.path, trained.algo)
         model = ALGORITHMS[trained.algo].load(trained.path, env=env, device=args.device, buffer_size=1)
         env.seed(args.seed)  # loading has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")

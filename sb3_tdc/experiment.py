@@ -1,8 +1,10 @@
 """One run: environments, model, callbacks, run folder. Called by the command line, by searches and by tests."""
 
 import difflib
+import json
 import shutil
 import sys
+import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -97,10 +99,10 @@ class Outcome:
 
 def check_env_id(env_id: str) -> None:
     """:raises ValueError: naming the nearest environment, if it is not registered"""
-    if ":" in env_id or env_id in gym.registry:  # "module:Env-v0" registers itself when it is made
+    if env_id in gym.registry:
         return
     close = difflib.get_close_matches(env_id, gym.registry, n=3)
-    nearest = f"; did you mean {' or '.join(close)}?" if close else ""
+    nearest = f"; did you mean {' or '.join(close)}?" if close else "."
     raise ValueError(
         f"There is no environment {env_id!r}{nearest} "
         "An environment of another package is registered by --gym-packages PACKAGE."
@@ -127,21 +129,22 @@ def make_envs(
     :param normalization: saved statistics for ``VecNormalize``
     :param training: False: statistics stay as they are and rewards are not normalised
     """
+    spec = gym.spec(env_id)
 
-    def wrap(env: gym.Env) -> gym.Env:
+    def make_env(**kwargs: Any) -> gym.Env:  # Monitor comes around it: it must see the ends of the wrapped episodes
         if vec_env == "subproc":
             ignore_interrupts()
+        env = spec.make(**kwargs)
         for wrapper in hyperparams.env_wrapper:
             env = wrapper(env)
         return env
 
     env = make_vec_env(
-        gym.spec(env_id).make,
+        make_env,
         n_envs=n_envs,
         seed=seed,
         monitor_dir=str(monitor_folder) if monitor_folder else None,
         monitor_kwargs=hyperparams.monitor_kwargs,
-        wrapper_class=wrap,
         env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
         vec_env_cls=SubprocVecEnv if vec_env == "subproc" else DummyVecEnv,
     )
@@ -168,6 +171,8 @@ def train(experiment: Experiment) -> Outcome:
     """
     with ExitStack() as stack:
         try:
+            if experiment.trained_model is not None:
+                check_saved_by(experiment.trained_model, experiment.algo)
             env = stack.enter_context(_closing(_make_training_envs(experiment)))
             model = _make_model(experiment, env)
             model.set_logger(_make_logger(experiment))
@@ -178,9 +183,11 @@ def train(experiment: Experiment) -> Outcome:
                 eval_env = model._wrap_env(eval_env, verbose=0, monitor_wrapper=False)
             stop, progress = StopOnSignal(), ProgressCallback(experiment.progress_bar, experiment.verbose)
             callbacks = [*_make_callbacks(experiment, eval_env, progress, stop), progress, stop]
-        except (*_SETUP_ERRORS, KeyboardInterrupt) as error:
+        except BaseException as error:
             stack.close()
             shutil.rmtree(experiment.folder.path)
+            if not isinstance(error, (*_SETUP_ERRORS, KeyboardInterrupt)):
+                raise
             raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
         stack.callback(progress.close)
         with stop:
@@ -195,9 +202,15 @@ def train(experiment: Experiment) -> Outcome:
 
 def _make_training_envs(experiment: Experiment) -> VecEnv:
     normalization = None
-    if experiment.trained_model is not None and experiment.hyperparams.normalize is not None:
+    if experiment.trained_model is not None:
         run = RunFolder(experiment.trained_model.parent, experiment.folder.env_name)
         normalization = run.normalization(experiment.trained_model)
+        if not normalization.exists():
+            normalization = None
+        elif experiment.hyperparams.normalize is None:
+            raise ValueError(
+                f"{experiment.trained_model} was trained on normalised observations: add -params normalize:true"
+            )
     return make_envs(
         experiment.env_id,
         experiment.hyperparams,
@@ -235,10 +248,30 @@ def _make_model(experiment: Experiment, env: VecEnv) -> OffPolicyAlgorithm:
     for of_the_saved_model in ("policy", "policy_kwargs"):
         kwargs.pop(of_the_saved_model, None)
     model = algorithm.load(experiment.trained_model, env=env, **kwargs)
-    replay_buffer = experiment.trained_model.with_name(experiment.folder.replay_buffer.name)
+    run = RunFolder(experiment.trained_model.parent, experiment.folder.env_name)
+    replay_buffer = run.replay_buffer(experiment.trained_model)
     if replay_buffer.exists():
         model.load_replay_buffer(replay_buffer)
+        assert model.replay_buffer is not None
+        if model.replay_buffer.n_envs != env.num_envs:
+            raise ValueError(
+                f"{replay_buffer} is of {model.replay_buffer.n_envs} environments, this run has {env.num_envs}"
+            )
+        model.learning_starts = 0  # no random steps on top of the experience that is there
     return model
+
+
+def check_saved_by(path: Path, algo: str) -> None:
+    """:raises ValueError: if a file is not a saved model, or is one of another algorithm"""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            module = json.loads(archive.read("data"))["policy_class"]["__module__"]
+    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not the zip of a saved model") from error
+    modules = {a: {p.__module__ for p in ALGORITHMS[a].policy_aliases.values()} for a in ALGORITHMS}
+    others = [a for a in ALGORITHMS if module in modules[a]]
+    if others and algo not in others:
+        raise ValueError(f"{path} was saved by {' or '.join(others)}, not by {algo}: --algo {others[0]}")
 
 
 def _make_action_noise(hyperparams: Hyperparams, env: VecEnv) -> ActionNoise | None:
@@ -307,7 +340,7 @@ def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
     if normalization is not None:
         normalization.save(str(folder.normalization(folder.model)))
     if experiment.save_replay_buffer:
-        model.save_replay_buffer(folder.replay_buffer)
+        model.save_replay_buffer(folder.replay_buffer(folder.model))
 
 
 @contextmanager

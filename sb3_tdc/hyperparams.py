@@ -18,6 +18,7 @@ from typing import Any
 import torch as th
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 # What an entry may say besides the keyword arguments of the algorithm, with its type
@@ -139,7 +140,7 @@ def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> 
 
 def suggest(name: str, known: Iterable[str]) -> str:
     """:return: ", did you mean ...?", or nothing if no known name is near"""
-    by_lower = {k.lower(): k for k in known}
+    by_lower = {str(k).lower(): k for k in known}
     nearest = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
     return f"; did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
 
@@ -166,7 +167,7 @@ def _convert_mapping(mapping: dict[str, Any], hints: dict[str, Any], where: str)
             raise ValueError(f"{where}: unknown key {key!r}{suggest(str(key), hints)}")
         try:
             converted[key] = _convert(value, hints[key])
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             detail = f" ({error})" if str(error) else ""
             raise ValueError(f"{where}: {key} must be {_describe(hints[key])}, got {value!r}{detail}") from error
     return converted
@@ -176,7 +177,10 @@ def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], wher
     """Resolve the policy, and check ``policy_kwargs`` against its constructor."""
     policy = values.setdefault("policy", "MlpPolicy")
     if isinstance(policy, str) and "." in policy:
-        policy = values["policy"] = _import_class(policy)
+        try:
+            policy = values["policy"] = _import_class(policy, BasePolicy)
+        except ValueError as error:
+            raise ValueError(f"{where}: policy: {error}") from error
     if isinstance(policy, str):
         if policy not in algorithm.policy_aliases:
             raise ValueError(f"{where}: unknown policy {policy!r}{suggest(policy, algorithm.policy_aliases)}")
@@ -224,7 +228,7 @@ def _convert_union(value: Any, members: tuple[Any, ...]) -> Any:
     for member in members:
         try:
             return _convert(value, member)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             reasons += [str(error)] if str(error) else []
     raise TypeError("; ".join(reasons))
 
@@ -267,6 +271,8 @@ def _factories(entries: Any, where: str) -> list[Callable]:
     for entry in [] if entries is None else entries if isinstance(entries, list) else [entries]:
         name, kwargs = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else (entry, {})
         try:
+            if not isinstance(kwargs, dict | None):
+                raise TypeError
             cls = _import_class(name)
         except (TypeError, ValueError) as error:
             detail = f": {error}" if str(error) else ""

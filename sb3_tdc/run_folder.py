@@ -14,6 +14,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_tdc.hyperparams import suggest
 
+_CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
+
 
 @dataclass(frozen=True)
 class RunFolder:
@@ -79,10 +81,6 @@ class RunFolder:
         return self.path / "best_model.zip"
 
     @property
-    def replay_buffer(self) -> Path:
-        return self.path / "replay_buffer.pkl"
-
-    @property
     def config(self) -> dict[str, Any]:
         """The hyperparameters as they were read."""
         return yaml.safe_load((self.path / self.env_name / "config.yml").read_text())
@@ -96,17 +94,25 @@ class RunFolder:
         """:return: the model of every checkpoint, by timestep, oldest first"""
         found = {}
         for path in self.path.glob("rl_model_*_steps.zip"):
-            if match := re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name):
+            if match := _CHECKPOINT.fullmatch(path.name):
                 found[int(match[1])] = path
         return dict(sorted(found.items()))
 
     def normalization(self, model: Path) -> Path:
         """:return: where the ``VecNormalize`` statistics of one of the run's models are"""
-        if model == self.best_model:
+        if model.name == self.best_model.name:
             return self.path / "best_model_vecnormalize.pkl"
-        if match := re.fullmatch(r"rl_model_(\d+)_steps\.zip", model.name):
+        if match := _CHECKPOINT.fullmatch(model.name):
             return self.path / f"rl_model_vecnormalize_{match[1]}_steps.pkl"
         return self.path / self.env_name / "vecnormalize.pkl"
+
+    def replay_buffer(self, model: Path) -> Path:
+        """:return: where the replay buffer of one of the run's models is"""
+        if match := _CHECKPOINT.fullmatch(model.name):
+            return self.path / f"rl_model_replay_buffer_{match[1]}_steps.pkl"
+        if model.name == self.best_model.name:
+            return self.path / "best_model_replay_buffer.pkl"  # none is saved
+        return self.path / "replay_buffer.pkl"
 
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
         """Keep what the run was made from: hyperparameters, arguments, and the command."""

@@ -1,6 +1,7 @@
 """``python train.py --algo tdc --env Walker2d-v4``: arguments and messages; the run itself is in ``experiment``."""
 
 import argparse
+import shlex
 import sys
 import textwrap
 import time
@@ -33,7 +34,7 @@ def make_parser() -> Parser:
     add("--n-eval-envs", type=int, default=1, help="environments for evaluation")
     add("--save-freq", type=int, default=-1, help="save the model every so many steps (-1: only at the end)")
     add("--save-replay-buffer", action="store_true", help="save the replay buffer with the model")
-    add("--log-interval", type=int, default=-1, help="episodes between log entries (-1: 4, -2: no log)")
+    add("--log-interval", type=int, default=-1, help="episodes between log entries (-1: 4, 0: no log)")
     add("-tb", "--tensorboard-log", help='TensorBoard folder (none given: the run\'s own; "": off)')
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="environments in this process or in their own")
     add("--eval-env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the evaluation environment")
@@ -71,8 +72,10 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
 
     :raises ValueError: for anything that is not allowed
     """
-    apply_common_arguments(args)
+    args.env = apply_common_arguments(args, args.env)
     check_env_id(args.env)
+    if args.n_timesteps < 1 and args.n_timesteps != -1:
+        raise ValueError(f"-n must be at least 1 (or -1: as in the hyperparameters), got {args.n_timesteps}")
     for name in ("eval_episodes", "n_eval_envs"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(args, name)}")
@@ -106,7 +109,7 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
         eval_env_kwargs=args.eval_env_kwargs,
         tensorboard_log=args.tensorboard_log,
         trained_model=args.trained_agent,
-        log_interval={-1: 4, -2: None}.get(args.log_interval, args.log_interval),
+        log_interval=4 if args.log_interval == -1 else max(args.log_interval, 0) or None,
         progress_bar=progress_bar,
         verbose=args.verbose,
     )
@@ -120,6 +123,15 @@ def _has_tqdm(verbose: int) -> bool:
             print('For a progress bar: pip install "sb3-tdc[progress]"')
         return False
     return True
+
+
+def _command_to_go_on(argv: Sequence[str] | None, n_timesteps: int, model: Path) -> str:
+    """The arguments of this run, but for the number of steps and the model to start from."""
+    without = Parser("")
+    without.add_argument("-n", "--n-timesteps")
+    without.add_argument("-i", "--trained-agent")
+    _, others = without.parse_known_args(argv)
+    return shlex.join(["-n", str(n_timesteps), "-i", str(model), *others])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -148,8 +160,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"Saved {folder.model} after {timedelta(seconds=round(time.monotonic() - start))}")
     if outcome.interrupted:
         steps, total = outcome.model.num_timesteps, experiment.hyperparams.n_timesteps
-        print(f"Stopped at step {steps:,} of {total:,}. To go on from there with a new run:")
-        print(f"  python train.py --algo {args.algo} --env {args.env} -n {total - steps} -i {folder.model}")
+        experience = "with" if args.save_replay_buffer else "without (--save-replay-buffer keeps it)"
+        print(f"Stopped at step {steps:,} of {total:,}. To go on in a new run, {experience} the replay buffer:")
+        print(f"  python train.py {_command_to_go_on(argv, total - steps, folder.model)}")
         return 130
     if args.verbose > 0:
         print(f"To watch it: python enjoy.py {folder.path}")

@@ -4,7 +4,7 @@ TDC in RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo td
 The only module that imports ``rl_zoo3`` (extra ``[zoo]``).
 """
 
-import itertools
+import argparse
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -75,8 +75,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     from rl_zoo3.train import train
 
     command, *arguments = argv
-    trains_tdc = command == "train" and ("--algo", "tdc") in itertools.pairwise(arguments)
-    if trains_tdc and not {"-conf", "--conf-file"} & set(arguments):
+    relevant = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    relevant.add_argument("--algo")
+    relevant.add_argument("-conf", "--conf-file")
+    chosen, _ = relevant.parse_known_args(arguments)
+    if command == "train" and chosen.algo == "tdc" and chosen.conf_file is None:
         arguments += ["-conf", str(hyperparams_file("tdc"))]
     sys.argv = [f"sb3_tdc.zoo {command}", *arguments]  # RL Zoo reads its arguments from there
     {"train": train, "enjoy": enjoy}[command]()

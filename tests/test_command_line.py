@@ -1,6 +1,7 @@
 """``train.py`` and ``enjoy.py`` from end to end, in a temporary folder."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -99,6 +100,8 @@ def test_stochastic_head_several_environments_and_normalisation(tmp_path, capsys
     capsys.readouterr()
     assert run_enjoy(folder) == 0
     returns = capsys.readouterr().out
+    assert run_enjoy(folder / "Hopper-v4.zip") == 0  # what lies beside a zip counts
+    assert capsys.readouterr().out == returns
     assert run_enjoy(folder, "--load-best") == 0
     # The agent sees normalised observations, but the returns are the environment's: a Hopper lives on 1 a step
     episodes = [line.split() for line in returns.splitlines() if line.startswith("Episode")]
@@ -110,13 +113,64 @@ def test_stochastic_head_several_environments_and_normalisation(tmp_path, capsys
     assert "vecnormalize.pkl is missing" in capsys.readouterr().err
 
 
-def test_going_on_from_a_saved_model(tmp_path):
-    assert run_train(tmp_path, "--save-replay-buffer", small=[*SMALL, "normalize:true"]) == 0
-    first = tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip"
-    before = TDC.load(first)
-    assert run_train(tmp_path, "-i", first, n=120, small=[*SMALL, "normalize:true"]) == 0
-    after = TDC.load(tmp_path / "tdc" / "Hopper-v4_2" / "Hopper-v4.zip")
-    assert after._n_updates == before._n_updates + 20  # warm-up again, then on from the saved count
+def test_going_on_from_a_saved_model(tmp_path, capsys):
+    normalized = [*SMALL, "normalize:true"]
+    assert run_train(tmp_path, "--save-replay-buffer", "--save-freq", 200, small=normalized) == 0
+    first = tmp_path / "tdc" / "Hopper-v4_1"
+    for i, (name, updates) in enumerate((("Hopper-v4.zip", 200), ("rl_model_200_steps.zip", 99)), start=2):
+        assert TDC.load(first / name)._n_updates == updates
+        assert run_train(tmp_path, "-i", first / name, n=120, small=normalized) == 0
+        after = TDC.load(tmp_path / "tdc" / f"Hopper-v4_{i}" / "Hopper-v4.zip")
+        assert after._n_updates == updates + 120  # the replay buffer was there: no warm-up again
+    assert run_train(tmp_path, "-i", first / "best_model.zip", n=120, small=normalized) == 0  # has none: warm-up again
+    best, after = (TDC.load(p) for p in (first / "best_model.zip", tmp_path / "tdc" / "Hopper-v4_4" / "Hopper-v4.zip"))
+    assert after._n_updates == best._n_updates + 20
+
+    for arguments, small, message in (
+        (["-i", first / "Hopper-v4.zip"], SMALL, "was trained on normalised observations: add -params normalize:true"),
+        (["-i", first / "Hopper-v4.zip"], [*normalized, "n_envs:2"], "is of 1 environments, this run has 2"),
+        (["-i", first / "Hopper-v4.zip", "--algo", "sac"], SMALL_ANY, "was saved by tdc, not by sac: --algo tdc"),
+    ):
+        with pytest.raises(SystemExit):
+            run_train(tmp_path, *arguments, small=small)
+        assert message in capsys.readouterr().err
+
+
+def test_the_command_to_go_on_is_the_same_experiment(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(
+        StopOnSignal, "_on_step", lambda self: setattr(self, "requested", self.n_calls == 150) or self.n_calls < 150
+    )
+    assert run_train(tmp_path, "-params", *SMALL[1:], "lam:0.25", "normalize:true", small=[]) == 130
+    (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  python train.py")]
+    monkeypatch.undo()
+    assert train.main(shlex.split(command)[2:]) == 0
+    model = TDC.load(tmp_path / "tdc" / "Hopper-v4_2" / "Hopper-v4.zip")
+    assert (model.lam, model.num_timesteps, model.batch_size) == (0.25, 150, 16)
+
+
+def test_a_time_limit_of_the_hyperparameters_ends_episodes(tmp_path, capsys):
+    (tmp_path / "my.yml").write_text(
+        "default: {n_timesteps: 300, env_wrapper: [{gymnasium.wrappers.TimeLimit: {max_episode_steps: 20}}]}"
+    )
+    assert run_train(tmp_path, "-conf", tmp_path / "my.yml", env="Pendulum-v1") == 0
+    with np.load(tmp_path / "tdc" / "Pendulum-v1_1" / "evaluations.npz") as evaluations:
+        assert evaluations["ep_lengths"].tolist() == [[20, 20], [20, 20]]
+    capsys.readouterr()
+    assert run_enjoy(tmp_path / "tdc" / "Pendulum-v1_1") == 0
+    assert ", 20 steps" in capsys.readouterr().out
+
+
+def test_an_environment_named_with_its_package(tmp_path, monkeypatch):
+    (tmp_path / "my_package.py").write_text(
+        "import gymnasium\ngymnasium.register('Mine-v0', 'gymnasium.envs.classic_control:PendulumEnv', max_episode_steps=30)"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run_train(tmp_path, env="my_package:Mine-v0") == 0
+    assert run_enjoy(tmp_path / "tdc" / "Mine-v0_1") == 0
+
+
+def test_a_log_of_nothing(tmp_path):
+    assert run_train(tmp_path, "--log-interval", 0) == 0
 
 
 def test_enjoy_finds_models(tmp_path, capsys):
@@ -139,6 +193,7 @@ def test_enjoy_finds_models(tmp_path, capsys):
         (["--env", "Hoper-v4", "-f", tmp_path], "no run of tdc on Hoper-v4"),
         ([*by_name, "--exp-id", 3], "no run 3 of tdc on Hopper-v4"),
         ([tmp_path], "is not the folder of a run"),
+        ([folder / "evaluations.npz"], "evaluations.npz is not the zip of a saved model"),
     ):
         with pytest.raises(SystemExit) as exit_:
             run_enjoy(*args)
@@ -209,9 +264,8 @@ def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
     assert process.returncode == 130, err
     assert "Traceback" not in err
     model = tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip"
-    assert (
-        f"python train.py --algo tdc --env Hopper-v4 -n {1_000_000 - TDC.load(model).num_timesteps} -i {model}" in out
-    )
+    left = 1_000_000 - TDC.load(model).num_timesteps
+    assert f"python train.py -n {left} -i {model} --env Hopper-v4 -f {tmp_path} --eval-freq -1" in out
 
 
 def test_stopping_an_evaluation_that_would_never_end(tmp_path):
@@ -267,6 +321,10 @@ def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
         (["-params", "lam:[1"], "the value of lam is not valid YAML: '[1'"),
         (["-conf", "nothing.yml"], "nothing.yml: No such file"),
         (["-i", "nothing.zip"], "-i must be the zip of a model, got nothing.zip"),
+        (["-n", "0"], "-n must be at least 1 (or -1: as in the hyperparameters), got 0"),
+        (["-params", "n_timesteps:.inf"], "n_timesteps must be an integer, got inf"),
+        (["-params", "policy:os.path"], "policy: 'os.path' names no BasePolicy class"),
+        (["-params", "env_wrapper:{gymnasium.wrappers.TimeLimit: 100}"], "env_wrapper must name a class, or map it"),
         (["--eval-episodes", "0"], "--eval-episodes must be at least 1, got 0"),
         (["--gym-packages", "no_such_package"], "there is no module 'no_such_package': pip install no_such_package"),
         (["--env", "CartPole-v1"], "env must have a Box action space"),

@@ -43,3 +43,5 @@ def check_action_space(action_space: spaces.Space) -> None:
             f"env must have a bounded action space, got {action_space}: "
             "wrap it in gymnasium.wrappers.RescaleAction or give the Box finite bounds"
         )
+    if not (action_space.low < action_space.high).all():
+        raise ValueError(f"env must have an action space with low < high, got {action_space}")

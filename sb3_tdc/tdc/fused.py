@@ -22,8 +22,8 @@ from stable_baselines3.sac.policies import Actor as TanhGaussianActor
 from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import nn
 
-from sb3_tdc.tdc.policies import QuantileCritic
-from sb3_tdc.tdc.quantiles import QuantileHuberGradient
+from sb3_tdc.tdc.policies import QuantileCritic, TDCPolicy
+from sb3_tdc.tdc.quantiles import QuantileHuberGradient, lcb_target
 
 if TYPE_CHECKING:
     from sb3_tdc.tdc.tdc import TDC
@@ -32,8 +32,15 @@ _LOG_SQRT_2_PI = 0.5 * math.log(2 * math.pi)
 _TANH_EPSILON = 1e-6  # in the density of the tanh-Gaussian, as in SB3
 
 
+# What a subclass of TDC may override, and then expects to be called
+_METHODS = ("train", "update_critics", "update_actor", "update_targets", "_sample_target_actions")
+_CLASSES = (TDCPolicy, DeterministicActor, TanhGaussianActor, QuantileCritic)
+
+
 def obstacles(model: "TDC") -> list[str]:
     """:return: what stands in the way of the fused update, in words; nothing where it applies"""
+    from sb3_tdc.tdc.tdc import TDC
+
     policy, found = model.policy, []
     space = model.observation_space
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
@@ -42,15 +49,33 @@ def obstacles(model: "TDC") -> list[str]:
         found.append(f"the features extractor is {policy.features_extractor_class.__name__}")
     if policy.activation_fn is not nn.ReLU:
         found.append(f"the activation is {policy.activation_fn.__name__}, not ReLU")
-    if policy.optimizer_class is not th.optim.Adam or not set(policy.optimizer_kwargs) <= {"fused", "eps", "betas"}:
-        found.append(f"the optimizer is {policy.optimizer_class.__name__} with {policy.optimizer_kwargs}")
     if not all(len(arch) > 0 for arch in get_actor_critic_arch(policy.net_arch)):
         found.append("a network has no hidden layer")
-    if type(policy.actor) not in (DeterministicActor, TanhGaussianActor) or type(policy.critic) is not QuantileCritic:
-        found.append("the actor or the critic is of a class of its own")
+    found += [f"{name} is overridden" for name in _METHODS if getattr(type(model), name) is not getattr(TDC, name)]
+    networks = (policy, policy.actor, policy.actor_target, policy.critic, policy.critic_target)
+    found += [f"{type(n).__qualname__} is a class of its own" for n in networks if type(n) not in _CLASSES]
+    if _has_hooks(policy):
+        found.append("a network has hooks")
+    if not all(_is_plain_adam(network.optimizer) for network in (policy.actor, policy.critic)):
+        kind = f"{policy.optimizer_class.__name__} with {policy.optimizer_kwargs}"
+        found.append(f"an optimizer is not a plain Adam (the policy's: {kind})")
+    if not all(p.requires_grad for network in (policy.actor, policy.critic) for p in network.parameters()):
+        found.append("a parameter is frozen")
     if model.device.type != "cpu":
         found.append(f"the device is {model.device}")
     return found
+
+
+def _is_plain_adam(optimizer: Any) -> bool:
+    if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1:
+        return False
+    group = optimizer.param_groups[0]
+    return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or isinstance(group["lr"], th.Tensor))
+
+
+def _has_hooks(policy: nn.Module) -> bool:
+    kinds = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+    return any(getattr(module, kind) for module in policy.modules() for kind in kinds)
 
 
 class FlatAdam:
@@ -60,21 +85,25 @@ class FlatAdam:
     For everyone else the parameters, the optimizer's state and the targets stay what they were, now as views.
     """
 
-    def __init__(self, optimizer: th.optim.Optimizer, targets: list[nn.Parameter] | None = None):
-        self.optimizer = optimizer
-        self.parameters: list[nn.Parameter] = optimizer.param_groups[0]["params"]
-        self.value = self._flatten(self.parameters)
-        self.target = self._flatten(targets) if targets is not None else self.value
+    def __init__(self, network: Any, target: nn.Module):
+        self.network, self.optimizer = network, network.optimizer
+        self.parameters: list[nn.Parameter] = self.optimizer.param_groups[0]["params"]
+        self.targets = list(target.parameters())
+        self.value, self.target = self._flatten(self.parameters), self._flatten(self.targets)
         self.gradient, self.mean, self.square = (th.zeros_like(self.value) for _ in range(3))
         self.steps = th.zeros(len(self.parameters))
         moments = (self.views(flat) for flat in (self.mean, self.square))
         for parameter, step, mean, square in zip(self.parameters, self.steps, *moments, strict=True):
-            state = optimizer.state[parameter]
+            state = self.optimizer.state[parameter]
             if state:
                 step.copy_(state["step"])
                 mean.copy_(state["exp_avg"])
                 square.copy_(state["exp_avg_sq"])
-            optimizer.state[parameter] = {"step": step, "exp_avg": mean, "exp_avg_sq": square}
+            self.optimizer.state[parameter] = {"step": step, "exp_avg": mean, "exp_avg_sq": square}
+        self.owned = [
+            (p, p.data_ptr(), target, target.data_ptr(), self.optimizer.state[p]["exp_avg"])
+            for p, target in zip(self.parameters, self.targets, strict=True)
+        ]
 
     def views(self, flat: th.Tensor) -> list[th.Tensor]:
         """:return: the parts of a flat tensor, in the shapes of the parameters"""
@@ -88,12 +117,14 @@ class FlatAdam:
         return flat
 
     def owns_parameters(self) -> bool:
-        """:return: whether the parameters and the optimizer's state are still these"""
-        views = zip(self.parameters, self.views(self.value), self.views(self.mean), strict=True)
+        """:return: whether network, targets and optimizer still use these tensors, and all of them learn"""
         state = self.optimizer.state
-        return all(
-            p.data_ptr() == value.data_ptr() and state[p]["exp_avg"].data_ptr() == mean.data_ptr()
-            for p, value, mean in views
+        return self.network.optimizer is self.optimizer and all(
+            p.data_ptr() == value
+            and target.data_ptr() == target_value
+            and p.requires_grad
+            and state.get(p, {}).get("exp_avg") is mean
+            for p, value, target, target_value, mean in self.owned
         )
 
     def step(self) -> None:
@@ -281,8 +312,8 @@ class FusedUpdate:
 
     def __init__(self, model: "TDC", batch_size: int):
         self.model, self.batch_size = model, batch_size
-        self.critic_adam = FlatAdam(model.critic.optimizer, list(model.critic_target.parameters()))
-        self.actor_adam = FlatAdam(model.actor.optimizer, list(model.actor_target.parameters()))  # type: ignore[arg-type]
+        self.critic_adam = FlatAdam(model.critic, model.critic_target)
+        self.actor_adam = FlatAdam(model.actor, model.actor_target)
         obs_dim = model.policy.actor.features_dim
         action_dim = get_action_dim(model.critic.action_space)
 
@@ -299,11 +330,7 @@ class FusedUpdate:
         self.critic_gradient = gradient
         self.critic_target = Mlp(target, next_inputs)
         self.critic = Mlp(online, inputs, slopes=self.critic_target.activations[1:])
-        n_critics, n_quantiles = model.critic.n_critics, model.critic.n_quantiles
-        self.loss_gradient = QuantileHuberGradient(self.critic.activations[-1], n_quantiles)
-        self.mean, self.std = th.empty(n_critics, batch_size), th.empty(n_critics, batch_size)
-        self.centred = th.empty(n_critics, batch_size, n_quantiles)
-        self.target = empty(n_quantiles)
+        self.loss_gradient = QuantileHuberGradient(self.critic.activations[-1], model.critic.n_quantiles)
 
         # Q₁: the hidden layers of the first critic, then the mean of its quantiles folded into the last layer
         *hidden, self.quantile_layer = (layer.first() for layer in online)
@@ -325,9 +352,13 @@ class FusedUpdate:
         return [_layers(adam.views(flat)) for flat in (adam.value, adam.target, adam.gradient)]
 
     def fits(self, batch_size: int) -> bool:
-        """:return: whether the buffers are of this size, and the model's parameters still those of here"""
+        """:return: whether the buffers are of this size, and all that :func:`obstacles` looks at is as it was"""
         adams = (self.critic_adam, self.actor_adam)
-        return batch_size == self.batch_size and all(adam.owns_parameters() for adam in adams)
+        return (
+            batch_size == self.batch_size
+            and all(_is_plain_adam(adam.optimizer) and adam.owns_parameters() for adam in adams)
+            and not _has_hooks(self.model.policy)
+        )
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
@@ -355,31 +386,19 @@ class FusedUpdate:
         model = self.model
         self._set_target_actions(replay_data)
         quantiles = self.critic_target.forward()  # Eq. 3, (C, B, N)
-        th.mean(quantiles, dim=-1, out=self.mean)  # Eq. 4
-        th.sub(quantiles, self.mean.unsqueeze(-1), out=self.centred)
-        th.linalg.vector_norm(self.centred, dim=-1, out=self.std).div_(math.sqrt(quantiles.shape[-1]))
-        self._select(quantiles, self.mean - lam * self.std)
         discounts = replay_data.discounts if replay_data.discounts is not None else model.gamma
-        self.target.mul_((1 - replay_data.dones) * discounts).add_(replay_data.rewards)  # Eq. 7
+        target = lcb_target(  # Eq. 4–7
+            quantiles.transpose(0, 1), replay_data.rewards, replay_data.dones, discounts, lam
+        )
 
         self.observations.copy_(replay_data.observations)
         self.actions.copy_(replay_data.actions)
         current = self.critic.forward()
-        slope = self.loss_gradient(current, self.target, model.kappa)  # Eq. 8–10
+        slope = self.loss_gradient(current, target.quantiles, model.kappa)  # Eq. 8–10
         self.critic.backward(slope, self.critic_gradient)
         self.critic_adam.step()
         if model.diagnoses_critics:
-            model.diagnose_critics(current.transpose(0, 1), self.target, self.mean.T, self.std.T, lam)
-
-    def _select(self, quantiles: th.Tensor, score: th.Tensor) -> None:
-        """Eq. 5–6: the quantiles of the critic with the smallest score; of equal ones, of the first."""
-        best, target = score[0], quantiles[0]
-        for critic in range(1, len(score)):
-            smaller = score[critic] < best
-            th.where(smaller.unsqueeze(1), quantiles[critic], target, out=self.target)
-            best, target = th.minimum(score[critic], best), self.target
-        if len(score) == 1:
-            self.target.copy_(target)
+            model.diagnose_critics(current.transpose(0, 1), target)
 
     def _value_and_slope(self) -> tuple[th.Tensor, th.Tensor]:
         """Q₁ (Eq. 11) of the actions in the inputs, (B,), and the slope of −mean Q₁ at these actions, (B, A)."""

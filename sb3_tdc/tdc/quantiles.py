@@ -5,7 +5,7 @@ Shapes: ``B`` transitions of a minibatch, ``C`` critics, ``N`` quantiles. Equati
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch.autograd.function import once_differentiable
@@ -32,7 +32,7 @@ def mean_and_std(quantiles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     :return: two tensors (...,)
     """
     mean = quantiles.mean(dim=-1)
-    # vector_norm after centring: several times faster than torch.std
+    # vector_norm after centring is faster than torch.std
     std = th.linalg.vector_norm(quantiles - mean.unsqueeze(-1), dim=-1) / math.sqrt(quantiles.shape[-1])
     return mean, std
 
@@ -79,6 +79,38 @@ def td_target(
     return rewards + (1 - dones) * discounts * next_quantiles
 
 
+class Target(NamedTuple):
+    """
+    :param quantiles: (B, N), y_j (Eq. 7)
+    :param mean: (B, C), of the target critics (Eq. 4)
+    :param std: (B, C)
+    :param selected: (B,), indices of critics (Eq. 5)
+    """
+
+    quantiles: th.Tensor
+    mean: th.Tensor
+    std: th.Tensor
+    selected: th.Tensor
+
+
+def lcb_target(
+    next_quantiles: th.Tensor, rewards: th.Tensor, dones: th.Tensor, discounts: th.Tensor | float, lam: float
+) -> Target:
+    """
+    The λ-LCB target: of the critic with the smallest mean − λ·std, per transition (Eq. 4–7).
+
+    :param next_quantiles: (B, C, N), of the target critics at (s', ã)
+    :param rewards: (B, 1)
+    :param dones: (B, 1)
+    :param discounts: γ, or (B, 1)
+    :param lam: λ ≥ 0
+    :raises ValueError: if a column is not (B, 1)
+    """
+    mean, std = mean_and_std(next_quantiles)
+    selected = select_critic(mean, std, lam)
+    return Target(td_target(rewards, dones, discounts, take_critic(next_quantiles, selected)), mean, std, selected)
+
+
 def _check_shapes(current: th.Tensor, target: th.Tensor) -> None:
     if current.ndim != 3 or target.ndim != 2 or current.shape[0] != target.shape[0]:
         raise ValueError(
@@ -98,7 +130,7 @@ class QuantileHuberGradient:
     :func:`quantile_huber_gradient` for one set of shapes, in closed passes over one small buffer that is kept.
 
     With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the slope of ρ at z_k summed over the targets is
-    ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c). Autograd through all pairs is some 30 times slower.
+    ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c). Autograd through all pairs would take most of the time of an update.
 
     :param current: a tensor (C, B, N) of the shape, dtype and device to work with
     :param n_targets: M

@@ -21,17 +21,15 @@ from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
-    mean_and_std,
+    Target,
+    lcb_target,
     quantile_huber_gradient,
     quantile_huber_loss,
-    select_critic,
-    take_critic,
-    td_target,
 )
 
 SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
-# The critics' diagnostics (docs/tdc.md) are taken at every twentieth update: at every one they would cost a third
+# The critics' diagnostics (docs/tdc.md) are taken at every twentieth update: at every one they would slow it down
 DIAGNOSTICS_INTERVAL = 20
 
 
@@ -73,8 +71,8 @@ class TDC(OffPolicyAlgorithm):
     :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` from 0.1 on,
         a number fixes it
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
-    :param fused: the same update on static buffers, about half as long: None where it applies (plain ReLU networks,
-        flat observations, Adam, on the CPU), True to demand it, False for none
+    :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
+        observations, Adam, on the CPU), True to demand it, False for none
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
@@ -148,7 +146,7 @@ class TDC(OffPolicyAlgorithm):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs={**(policy_kwargs or {}), "stochastic_actor": stochastic_actor},
+            policy_kwargs=dict(policy_kwargs or {}),
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
@@ -192,11 +190,10 @@ class TDC(OffPolicyAlgorithm):
         self._initial_ent_coef()
         for name in ("lam", "learning_rate", "qf_learning_rate"):
             self._scheduled(name, progress_remaining=1.0)
-        if self.stochastic_actor != self.policy_kwargs["stochastic_actor"]:
-            raise ValueError(
-                f"stochastic_actor must be {self.policy_kwargs['stochastic_actor']}, as in the saved model, "
-                f"got {self.stochastic_actor}"
-            )
+        saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
+        if self.stochastic_actor is not saved:
+            raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
+        self._convert_train_freq()
 
     def _initial_ent_coef(self) -> float:
         coefficient = self.ent_coef
@@ -206,7 +203,7 @@ class TDC(OffPolicyAlgorithm):
             value = check_number("ent_coef", float(coefficient), 0.0)
             if value > 0 or not self._learns_ent_coef:
                 return value
-        except ValueError:
+        except (TypeError, ValueError):
             pass
         raise ValueError(
             'ent_coef must be "auto", "auto_" and a positive number (as in "auto_0.1"), '
@@ -230,7 +227,17 @@ class TDC(OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         self._check_arguments()
         self._setup_action_noise()
+        # The user's policy_kwargs stay theirs: SB3 compares them when a model is loaded
+        policy_kwargs, self.policy_kwargs = (
+            self.policy_kwargs,
+            {
+                **self.policy_kwargs,
+                "stochastic_actor": self.stochastic_actor,
+            },
+        )
         super()._setup_model()
+        self.policy_kwargs = policy_kwargs
+        self._built_stochastic_actor = self.stochastic_actor
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         # With a shared features extractor the actor and the critics have parameters in common: Polyak moves them once
@@ -260,7 +267,7 @@ class TDC(OffPolicyAlgorithm):
         self._fused_update: FusedUpdate | None = None
         self._obstacles = obstacles(self)
         if self.fused and self._obstacles:
-            raise ValueError(f"fused must be None or False here: {'; '.join(self._obstacles)}")
+            raise ValueError(self._obstacle_message())
         if self.verbose > 0 and self.fused is None:
             reason = f" ({'; '.join(self._obstacles)})" if self._obstacles else ""
             print(f"Using the {'readable' if reason else 'fused'} update{reason}")
@@ -294,11 +301,13 @@ class TDC(OffPolicyAlgorithm):
         fused_update = self._bind_fused_update(batch_size)
         if fused_update is None:
             self.policy.set_training_mode(True)
-        update = fused_update or self
 
         for _ in range(gradient_steps):
             self._n_updates += 1
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            # A replay buffer of the user's own may return another number of transitions than it was asked for
+            full = fused_update is not None and len(replay_data.rewards) == batch_size
+            update = fused_update if fused_update is not None and full else self
             update.update_critics(replay_data, lam)
             if self._n_updates % self.policy_delay == 0:
                 update.update_actor(replay_data)
@@ -313,11 +322,21 @@ class TDC(OffPolicyAlgorithm):
 
     def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
         """The same update on static buffers, where it applies; it is made anew when the parameters were replaced."""
-        if self.fused is False or (self.fused is None and self._obstacles):
-            self._fused_update = None
-        elif self._fused_update is None or not self._fused_update.fits(batch_size):
+        bound = self._fused_update
+        if bound is not None and self.fused is not False and bound.fits(batch_size):
+            return bound
+        self._fused_update = None
+        if self.fused is False or (bound is None and self._obstacles):
+            return None
+        self._obstacles = obstacles(self)  # again: optimizers and networks can be replaced by their owner
+        if not self._obstacles:
             self._fused_update = FusedUpdate(self, batch_size)
+        elif self.fused:
+            raise ValueError(self._obstacle_message())
         return self._fused_update
+
+    def _obstacle_message(self) -> str:
+        return f"fused must be None or False here: {'; '.join(self._obstacles)}"
 
     def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
         """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""
@@ -334,19 +353,15 @@ class TDC(OffPolicyAlgorithm):
         with th.no_grad():
             next_actions = self._sample_target_actions(replay_data)
             next_quantiles = self.critic_target(replay_data.next_observations, next_actions)  # Eq. 3
-            mean, std = mean_and_std(next_quantiles)  # Eq. 4
-            selected = select_critic(mean, std, lam)  # Eq. 5
-            target_quantiles = td_target(  # Eq. 6–7
-                replay_data.rewards, replay_data.dones, discounts, take_critic(next_quantiles, selected)
-            )
+            target = lcb_target(next_quantiles, replay_data.rewards, replay_data.dones, discounts, lam)  # Eq. 4–7
         current_quantiles = self.critic(replay_data.observations, replay_data.actions)
 
         # Only the gradient of the loss (Eq. 8–10) is needed to learn
         self.critic.optimizer.zero_grad()
-        current_quantiles.backward(quantile_huber_gradient(current_quantiles, target_quantiles, self.kappa))
+        current_quantiles.backward(quantile_huber_gradient(current_quantiles, target.quantiles, self.kappa))
         self.critic.optimizer.step()
         if self.diagnoses_critics:
-            self.diagnose_critics(current_quantiles.detach(), target_quantiles, mean, std, lam)
+            self.diagnose_critics(current_quantiles.detach(), target)
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
         """One step of the actor (Eq. 11–13), then of the temperature."""
@@ -385,7 +400,10 @@ class TDC(OffPolicyAlgorithm):
     def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
         optimizer.zero_grad()
         # Gradients of these parameters alone: the critics stay as they are, and cost nothing
-        loss.backward(inputs=[parameter for group in optimizer.param_groups for parameter in group["params"]])
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        learning = [parameter for parameter in parameters if parameter.requires_grad]
+        if learning:
+            loss.backward(inputs=learning)
         optimizer.step()
 
     @th.no_grad()
@@ -406,15 +424,16 @@ class TDC(OffPolicyAlgorithm):
         """Whether this is an update at which the critics' diagnostics are taken."""
         return self._n_updates % DIAGNOSTICS_INTERVAL == 1
 
-    def diagnose_critics(
-        self, current: th.Tensor, target: th.Tensor, mean: th.Tensor, std: th.Tensor, lam: float
-    ) -> None:
-        """Shapes (B, C, N), (B, N), (B, C), (B, C); each figure is described in docs/tdc.md."""
-        selected = select_critic(mean, std, lam)
-        td_errors = target.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
+    def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
+        """
+        :param current: (B, C, N)
+        :param target: each figure is described in docs/tdc.md
+        """
+        y, mean, std, selected = target
+        td_errors = y.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
         self.diagnose(
-            critic_loss=quantile_huber_loss(current, target, self.kappa),  # Eq. 10
-            target_mean=target.mean(),
+            critic_loss=quantile_huber_loss(current, y, self.kappa),  # Eq. 10
+            target_mean=y.mean(),
             target_std=std.gather(1, selected.unsqueeze(1)).mean(),
             critic_disagreement=(mean.amax(dim=1) - mean.amin(dim=1)).mean(),
             td_error_var=td_errors.var(dim=0, correction=0).mean(),
@@ -435,10 +454,11 @@ class TDC(OffPolicyAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self._fused_update is None or self.num_timesteps < learning_starts:
+        fused = self._fused_update
+        if fused is None or self.num_timesteps < learning_starts or not fused.actor_adam.owns_parameters():
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, np.ndarray)
-        scaled_action = self._fused_update.act(self._last_obs).reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+        scaled_action = fused.act(self._last_obs).reshape(-1, *self.action_space.shape)  # type: ignore[misc]
         if action_noise is not None:
             scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
         return self.policy.unscale_action(scaled_action), scaled_action
@@ -453,7 +473,11 @@ class TDC(OffPolicyAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         observations = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
-        for name, array in ("action", buffer_action), ("reward", reward), *observations.items():
+        arrays = [("action", buffer_action), ("reward", reward), *observations.items()]
+        for info in (info for info, done in zip(infos, dones, strict=True) if done):
+            last = info.get("terminal_observation", {})  # new_obs is the first of the next episode already
+            arrays += (last if isinstance(last, dict) else {"terminal observation": np.asarray(last)}).items()
+        for name, array in arrays:
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
                 source = "policy chose an" if name == "action" else "environment returned a non-finite"
@@ -490,7 +514,10 @@ class TDC(OffPolicyAlgorithm):
         :param include: name of parameters that might be excluded but should be included anyway
         :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
         """
-        broken = [name for name, weight in self.policy.state_dict().items() if not weight.isfinite().all()]
+        weights = dict(self.policy.state_dict())
+        if self.stochastic_actor:
+            weights["ent_coef"] = self.current_ent_coef()
+        broken = [name for name, weight in weights.items() if not weight.isfinite().all()]
         if broken:
             raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
         super().save(path, exclude, include)

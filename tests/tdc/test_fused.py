@@ -156,8 +156,11 @@ def test_policies_can_be_copied_and_saved(tmp_path):
     ("kwargs", "reason"),
     [
         ({"policy_kwargs": {"activation_fn": nn.Tanh}}, "the activation is Tanh, not ReLU"),
-        ({"policy_kwargs": {"optimizer_class": th.optim.SGD}}, "the optimizer is SGD"),
-        ({"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}}, "the optimizer is Adam with .*weight_decay"),
+        ({"policy_kwargs": {"optimizer_class": th.optim.SGD}}, "an optimizer is not a plain Adam .*SGD"),
+        (
+            {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}},
+            "an optimizer is not a plain Adam .*weight_decay",
+        ),
         ({"policy_kwargs": {"net_arch": []}}, "a network has no hidden layer"),
         ({"policy_kwargs": {"features_extractor_class": BatchNormExtractor}}, "the features extractor is BatchNorm"),
     ],
@@ -188,3 +191,88 @@ def test_float64_and_one_dimensional_actions():
 
     model = make(Odd(), policy_kwargs=SMALL, fused=True).learn(80)
     assert isinstance(model._fused_update, FusedUpdate)
+
+
+class Counting(TDC):
+    calls = 0
+
+    def update_actor(self, replay_data):
+        Counting.calls += 1
+        super().update_actor(replay_data)
+
+
+class OwnPolicy(type(make().policy)):
+    pass
+
+
+def test_what_a_user_overrides_is_called():
+    model = Counting("MlpPolicy", "Pendulum-v1", learning_starts=40, policy_kwargs=SMALL, device="cpu").learn(60)
+    assert (Counting.calls, model._obstacles) == (model._n_updates // 2, ["update_actor is overridden"])
+    own = TDC(OwnPolicy, "Pendulum-v1", learning_starts=40, policy_kwargs=SMALL, device="cpu").learn(60)
+    assert own._obstacles == ["OwnPolicy is a class of its own"]
+
+
+def replace_optimizer(model):
+    model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=0.0)
+    model.actor.optimizer.step = lambda: None
+
+
+def freeze(model):
+    for parameter in model.actor.parameters():
+        parameter.requires_grad_(False)
+
+
+def decay(model):
+    model.actor.optimizer.param_groups[0]["weight_decay"] = 0.5
+
+
+def hook(model):
+    model.critic.register_forward_hook(lambda *_: None)
+
+
+@pytest.mark.parametrize("change", [replace_optimizer, freeze, decay, hook])
+@pytest.mark.parametrize("after", [0, 60], ids=["before learning", "in mid-run"])
+def test_what_a_user_changes_counts(change, after):
+    """As the readable update would do it, from the next step on."""
+    models = []
+    for fused in (None, False):
+        model = make(TwoActions(), fused=fused, seed=2)
+        if after:
+            model.learn(after)
+            assert (model._fused_update is None) is (fused is False)
+        change(model)
+        models.append(model.learn(60, reset_num_timesteps=False))
+        assert model._fused_update is None
+    assert_close(*({k: v.double() for k, v in weights(m).items()} for m in models), rtol=1e-3, atol=1e-4)
+    if change in (replace_optimizer, freeze) and not after:
+        start = weights(make(TwoActions(), seed=2))
+        assert all(th.equal(start[k], w) for k, w in weights(models[0]).items() if k.startswith("actor."))
+
+
+def test_fresh_parameters_into_a_trained_model():
+    """A fresh optimizer has no state at all."""
+    model, fresh = make().learn(60), make(seed=3)
+    model.set_parameters(fresh.get_parameters())
+    assert_same_weights(weights(model), weights(fresh))
+    model.learn(60, reset_num_timesteps=False)
+    assert model._fused_update is not None
+
+
+def test_replaced_targets_and_actors_are_noticed():
+    model = make(tau=0.5).learn(60)
+    for network in (model.critic_target, model.actor):
+        nn.utils.vector_to_parameters(th.zeros(sum(p.numel() for p in network.parameters())), network.parameters())
+    model._last_obs = np.ones((1, 3), np.float32)
+    assert model._sample_action(0)[1].item() == 0.0 == model.predict(model._last_obs)[0].item()
+    model.train(gradient_steps=2, batch_size=16)
+    assert sum(p.abs().sum() for p in model.critic_target.parameters()) > 0
+
+
+def test_a_buffer_that_returns_fewer_transitions():
+    model = make_model(fused=True)
+    model.replay_buffer = BatchQueue(
+        [*random_batches(1, batch=3), *random_batches(1, batch=16), *random_batches(1, batch=1)]
+    )
+    before = weights(model)
+    model.train(gradient_steps=3, batch_size=16)
+    assert any(not th.equal(before[name], weight) for name, weight in weights(model).items())

@@ -21,6 +21,7 @@ from torch import nn
 
 from sb3_tdc import TDC, NonFiniteError
 from sb3_tdc.tdc import MlpPolicy
+from sb3_tdc.tdc.quantiles import Target
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
 from tests.tdc.test_update import TwoActions
 
@@ -334,7 +335,7 @@ def test_diagnostics_by_hand():
     current = th.tensor([[[0.0, 2.0], [4.0, 4.0]], [[1.0, 1.0], [0.0, 6.0]]])  # (B, C, N)
     target = th.tensor([[1.0, 3.0], [0.0, 0.0]])
     mean, std = th.tensor([[1.0, 4.0], [5.0, 2.0]]), th.tensor([[0.5, 9.0], [9.0, 0.7]])
-    model.diagnose_critics(current, target, mean, std, lam=0.0)  # selects 1, then 2
+    model.diagnose_critics(current, Target(target, mean, std, selected=th.tensor([0, 1])))
     means = model._diagnostics.fetch()
     assert means["target_mean"] == pytest.approx(1.0)
     assert means["target_std"] == pytest.approx(0.6)  # of the selected: 0.5 and 0.7
@@ -379,6 +380,8 @@ def test_diagnostics_by_hand():
         ({"ent_coef": "automatic"}, 'ent_coef must be "auto", "auto_" .* got \'automatic\''),
         ({"ent_coef": "auto_0"}, "ent_coef must be .* got 'auto_0'"),
         ({"ent_coef": -0.1}, "ent_coef must be .* got -0.1"),
+        ({"ent_coef": None, "stochastic_actor": True}, "ent_coef must be .* got None"),
+        ({"train_freq": (1, "epoch")}, "unit of the `train_freq` must be either 'step' or 'episode' not 'epoch'"),
         ({"target_entropy": "low"}, "target_entropy .* got 'low'"),
         ({"env": "CartPole-v1"}, r"env must have a Box action space \(continuous actions\), got Discrete"),
     ],
@@ -396,6 +399,12 @@ def test_unbounded_actions_are_refused():
 
     with pytest.raises(ValueError, match="env must have a bounded action space"):
         make(Unbounded())
+
+    class Degenerate(TwoActions):
+        action_space = gym.spaces.Box(np.array([-1, 2]), np.array([1, 2]), dtype=np.float32)
+
+    with pytest.raises(ValueError, match="low < high"):
+        make(Degenerate())
 
 
 def test_a_schedule_that_turns_bad_is_named():
@@ -436,6 +445,20 @@ def test_a_broken_environment_stops_the_training(broken):
     assert all(weight.isfinite().all() for weight in model.policy.state_dict().values())
 
 
+def test_a_last_observation_that_is_not_finite_is_not_stored():
+    """A simulation that blows up ends its episode with NaN; what step() returns then is the next episode's start."""
+
+    class BlowsUp(TwoActions):
+        def step(self, action):
+            observation, reward, terminated, truncated, info = super().step(action)
+            return observation * (np.nan if terminated else 1.0), reward, terminated, truncated, info
+
+    model = make(BlowsUp())
+    with pytest.raises(NonFiniteError, match=r"returned a non-finite terminal observation .* at timestep 12 "):
+        model.learn(100)
+    assert model.replay_buffer.pos == 11
+
+
 def test_a_diverged_loss_stops_the_training_and_spares_the_saved_model(tmp_path):
     path = tmp_path / "model.zip"
     model = make(learning_starts=40)
@@ -457,6 +480,23 @@ def test_a_loss_is_checked_even_if_nothing_is_logged():
     model.replay_buffer.rewards[:] = np.inf  # the gradient of the Huber loss stays finite: only the value tells
     with warnings.catch_warnings(), pytest.raises(NonFiniteError, match="critic_loss is inf since update"):
         model.learn(5_000, log_interval=None, reset_num_timesteps=False)
+
+
+def test_loading_with_the_policy_kwargs_of_the_user(tmp_path):
+    kwargs = {"net_arch": [8], "n_quantiles": 3}
+    model = TDC("MlpPolicy", "Pendulum-v1", policy_kwargs=kwargs, device="cpu", stochastic_actor=True)
+    assert model.policy_kwargs == kwargs == {"net_arch": [8], "n_quantiles": 3}
+    model.save(tmp_path / "model")
+    assert TDC.load(tmp_path / "model", policy_kwargs=kwargs).stochastic_actor
+
+
+def test_frozen_layers_stay(capsys):
+    model = make(fused=False)
+    model.actor.mu[0].weight.requires_grad_(False)
+    before = weights(model)
+    after = weights(model.learn(80))
+    assert th.equal(before["actor.mu.0.weight"], after["actor.mu.0.weight"])
+    assert not th.equal(before["actor.mu.2.weight"], after["actor.mu.2.weight"])
 
 
 def test_it_saves_to_a_stream():
