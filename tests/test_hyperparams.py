@@ -99,6 +99,8 @@ def test_values_become_what_the_constructor_wants():
         ({"seed": 1}, "unknown key 'seed'"),
         ({"gamma": "high"}, "file.yml, Env-v0: gamma must be a number, got 'high'"),
         ({"batch_size": 2.5}, "batch_size must be an integer, got 2.5"),
+        ({"batch_size": float("inf")}, "batch_size must be an integer, got inf"),
+        ({7: 1}, "unknown key 7"),
         ({"batch_size": True}, "batch_size must be an integer, got True"),
         ({"stochastic_actor": 1}, "stochastic_actor must be true or false, got 1"),
         ({"lam": "sometimes"}, "lam must be a number or a schedule (\"lin_\" and a number), got 'sometimes'"),
