@@ -9,6 +9,7 @@ Shapes: C critics, B transitions, N quantiles, D observation, A action.
 """
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,7 +55,7 @@ def obstacles(model: "TDC") -> list[str]:
     found += [f"{name} is overridden" for name in _METHODS if getattr(type(model), name) is not getattr(TDC, name)]
     networks = (policy, policy.actor, policy.actor_target, policy.critic, policy.critic_target)
     found += [f"{type(n).__qualname__} is a class of its own" for n in networks if type(n) not in _CLASSES]
-    if _has_hooks(policy):
+    if _has_hooks(policy.modules()):
         found.append("a network has hooks")
     if not all(_is_plain_adam(network.optimizer) for network in (policy.actor, policy.critic)):
         kind = f"{policy.optimizer_class.__name__} with {policy.optimizer_kwargs}"
@@ -73,9 +74,8 @@ def _is_plain_adam(optimizer: Any) -> bool:
     return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or isinstance(group["lr"], th.Tensor))
 
 
-def _has_hooks(policy: nn.Module) -> bool:
-    kinds = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-    return any(getattr(module, kind) for module in policy.modules() for kind in kinds)
+def _has_hooks(modules: Iterable[nn.Module]) -> bool:
+    return any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules)
 
 
 class FlatAdam:
@@ -312,6 +312,7 @@ class FusedUpdate:
 
     def __init__(self, model: "TDC", batch_size: int):
         self.model, self.batch_size = model, batch_size
+        self.modules = list(model.policy.modules())
         self.critic_adam = FlatAdam(model.critic, model.critic_target)
         self.actor_adam = FlatAdam(model.actor, model.actor_target)
         obs_dim = model.policy.actor.features_dim
@@ -357,7 +358,7 @@ class FusedUpdate:
         return (
             batch_size == self.batch_size
             and all(_is_plain_adam(adam.optimizer) and adam.owns_parameters() for adam in adams)
-            and not _has_hooks(self.model.policy)
+            and not _has_hooks(self.modules)
         )
 
     def act(self, observations: np.ndarray) -> np.ndarray:
