@@ -77,7 +77,7 @@ def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str,
     lines = [
         "# Speed",
         "",
-        "Made by `python -m benchmarks.speed`; do not edit.",
+        f"Made by `python -m benchmarks.speed --rounds {results['rounds']} --steps {results['steps']}`; do not edit.",
         "",
         f"{results['hardware']}. Whole environment steps (simulator, replay, one gradient step of batch 256, 256-256"
         " networks, float32), one gradient step a step. A ratio is the peer's time over TDC's (64 quantiles, fused"
