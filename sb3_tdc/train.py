@@ -14,7 +14,7 @@ import yaml
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments
-from sb3_tdc.experiment import ALGORITHMS, Experiment, check_env_id, train
+from sb3_tdc.experiment import ALGORITHMS, Experiment, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.run_folder import RunFolder
 from sb3_tdc.tdc import NonFiniteError
@@ -144,18 +144,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     start = time.monotonic()
     try:
         experiment = make_experiment(args)
-        folder = experiment.folder
-        if args.verbose > 0:
-            print(f"Training {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
+    except ValueError as error:
+        parser.fail(error)
+    folder = experiment.folder
+    if args.verbose > 0:
+        print(f"Training {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
+    try:
         outcome = train(experiment)
-    except KeyboardInterrupt:
-        print("Stopped without saving; what was saved before is still there.", file=sys.stderr)
-        return 130
+    except SetupError as error:
+        parser.fail(error)
     except NonFiniteError as error:
         print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)
         return 1
-    except ValueError as error:
-        parser.fail(error)
+    except KeyboardInterrupt:
+        print(f"Stopped without saving; what was saved before stays in {folder.path}", file=sys.stderr)
+        return 130
     if args.verbose > 0:
         print(f"Saved {folder.model} after {timedelta(seconds=round(time.monotonic() - start))}")
     if outcome.interrupted:
