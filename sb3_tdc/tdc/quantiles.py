@@ -1,4 +1,4 @@
-"""The mathematics of TDC-λ on quantiles: pure functions of tensors, no networks and no buffers.
+"""The mathematics of TDC-λ on quantiles: functions of tensors that know no networks and no replay.
 
 Shapes: ``B`` transitions of a minibatch, ``C`` critics, ``N`` quantiles. Equation numbers are the paper's
 (Osman et al., "Risk sensitive twin distributional critics with a lambda lower confidence bound").
@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import torch as th
 from torch.autograd.function import once_differentiable
 
-# The all-pairs differences of one chunk of rows stay in a buffer of this many floats (4 MiB): within the cache.
+# The all-pairs differences of one chunk of rows: this many floats (4 MiB). Smaller chunks cost more calls, larger ones
+# gain nothing.
 _CHUNK_ELEMENTS = 2**20
 
 

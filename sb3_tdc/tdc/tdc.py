@@ -228,13 +228,8 @@ class TDC(OffPolicyAlgorithm):
         self._check_arguments()
         self._setup_action_noise()
         # The user's policy_kwargs stay theirs: SB3 compares them when a model is loaded
-        policy_kwargs, self.policy_kwargs = (
-            self.policy_kwargs,
-            {
-                **self.policy_kwargs,
-                "stochastic_actor": self.stochastic_actor,
-            },
-        )
+        policy_kwargs = self.policy_kwargs
+        self.policy_kwargs = {**policy_kwargs, "stochastic_actor": self.stochastic_actor}
         super()._setup_model()
         self.policy_kwargs = policy_kwargs
         self._built_stochastic_actor = self.stochastic_actor
