@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import get_parameters_by_name, update_learni
 
 from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
 from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
-from sb3_tdc.tdc.fused import FusedUpdate, obstacles
+from sb3_tdc.tdc.fused import FusedUpdate, check_options, obstacles
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -29,8 +29,8 @@ from sb3_tdc.tdc.quantiles import (
 
 SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
-# The critics' diagnostics (docs/tdc.md) are taken at every twentieth update: at every one they would slow it down
-DIAGNOSTICS_INTERVAL = 20
+# The critics' diagnostics (docs/tdc.md) are taken at every fiftieth update: at every one they would slow it down
+DIAGNOSTICS_INTERVAL = 50
 
 
 class TDC(OffPolicyAlgorithm):
@@ -72,7 +72,9 @@ class TDC(OffPolicyAlgorithm):
         a number fixes it
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
     :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
-        observations, Adam, on the CPU), True to demand it, False for none
+        observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
+    :param fused_kwargs: what it may do besides: ``bfloat16`` (True: products between hidden layers of factors rounded
+        to bfloat16), ``compile_loss`` (True: the gradient of the loss by ``torch.compile``)
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
@@ -119,6 +121,7 @@ class TDC(OffPolicyAlgorithm):
         ent_coef: str | float = "auto",
         target_entropy: str | float = "auto",
         fused: bool | None = None,
+        fused_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -166,6 +169,7 @@ class TDC(OffPolicyAlgorithm):
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.fused = fused
+        self.fused_kwargs = dict(fused_kwargs or {})
 
         if _init_setup_model:
             self._setup_model()
@@ -193,6 +197,7 @@ class TDC(OffPolicyAlgorithm):
         saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
+        check_options(self.fused_kwargs)
         self._convert_train_freq()
 
     def _initial_ent_coef(self) -> float:
@@ -261,7 +266,7 @@ class TDC(OffPolicyAlgorithm):
     def _setup_fused_update(self) -> None:
         self._fused_update: FusedUpdate | None = None
         self._obstacles = obstacles(self)
-        if self.fused and self._obstacles:
+        if self._obstacles and (self.fused or self.fused_kwargs):
             raise ValueError(self._obstacle_message())
         if self.verbose > 0 and self.fused is None:
             reason = f" ({'; '.join(self._obstacles)})" if self._obstacles else ""
@@ -299,7 +304,10 @@ class TDC(OffPolicyAlgorithm):
 
         for _ in range(gradient_steps):
             self._n_updates += 1
-            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            if fused_update is None:
+                replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            else:
+                replay_data = fused_update.sample(batch_size)
             # A replay buffer of the user's own may return another number of transitions than it was asked for
             full = fused_update is not None and len(replay_data.rewards) == batch_size
             update = fused_update if fused_update is not None and full else self
@@ -331,7 +339,8 @@ class TDC(OffPolicyAlgorithm):
         return self._fused_update
 
     def _obstacle_message(self) -> str:
-        return f"fused must be None or False here: {'; '.join(self._obstacles)}"
+        allowed = "fused must be None or False" if self.fused else "fused_kwargs must be empty"
+        return f"{allowed} here: {'; '.join(self._obstacles)}"
 
     def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
         """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""

@@ -12,6 +12,7 @@ from torch import nn
 
 from sb3_tdc import TDC
 from sb3_tdc.tdc.fused import FusedUpdate
+from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 from tests.tdc.test_tdc import HEADS, SMALL, BatchNormExtractor, assert_same_weights, make, weights
 from tests.tdc.test_update import BATCH, BatchQueue, TwoActions, make_model, random_batches
 
@@ -276,3 +277,51 @@ def test_a_buffer_that_returns_fewer_transitions():
     before = weights(model)
     model.train(gradient_steps=3, batch_size=16)
     assert any(not th.equal(before[name], weight) for name, weight in weights(model).items())
+
+
+@HEADS
+def test_rounded_products_learn_nearly_the_same(stochastic_actor):
+    """bfloat16 has 8 bits of mantissa: a gradient differs by up to some per cent, and by more than float32 would."""
+    gradients = []
+    for bfloat16 in (False, True):
+        model = make_model(
+            stochastic_actor=stochastic_actor,
+            fused_kwargs={"bfloat16": bfloat16},
+            policy_kwargs={"net_arch": [64, 64, 64]},
+        )
+        model.replay_buffer = BatchQueue(random_batches(2, batch=64))
+        th.manual_seed(1)
+        model.train(gradient_steps=2, batch_size=64)
+        update = model._fused_update
+        assert model.critic.layers[0].weight.dtype == th.float32
+        gradients.append((update.critic_gradient[1].weight.clone(), update.actor_gradient[1].weight.clone()))
+    for exact, rounded in zip(*gradients, strict=True):
+        error = (rounded - exact).norm() / exact.norm()
+        assert 1e-4 < error < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kappa", [1.0, 0.0])
+def test_compiled_gradient_of_the_loss(kappa):
+    """Needs a C++ compiler."""
+    current, target = th.randn(2, 50, 16), th.randn(50, 12)
+    plain, compiled = (QuantileHuberGradient(current, 12, compiled) for compiled in (False, True))
+    th.testing.assert_close(compiled(current, target, kappa), plain(current, target, kappa), rtol=1e-5, atol=1e-8)
+    model = make(fused_kwargs={"compile_loss": True}).learn(60)
+    assert model._fused_update.loss_gradient.compiled is not None
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "reason"),
+    [
+        ({"fused_kwargs": {"bf16": True}}, "fused_kwargs may have bfloat16 and compile_loss, got 'bf16'"),
+        ({"fused_kwargs": {"bfloat16": 1}}, r"fused_kwargs\['bfloat16'\] must be True or False, got 1"),
+        (
+            {"fused_kwargs": {"bfloat16": True}, "policy_kwargs": {"activation_fn": nn.Tanh}},
+            "fused_kwargs must be empty here: the activation is Tanh",
+        ),
+    ],
+)
+def test_bad_options(kwargs, reason):
+    with pytest.raises(ValueError, match=reason):
+        make(**kwargs)
