@@ -73,8 +73,9 @@ class TDC(OffPolicyAlgorithm):
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
     :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
         observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
-    :param fused_kwargs: what it may do besides: ``bfloat16`` (True: products between hidden layers of factors rounded
-        to bfloat16), ``compile_loss`` (True: the gradient of the loss by ``torch.compile``)
+    :param fused_kwargs: what it may do besides, each True or False: ``bfloat16`` (products between hidden layers of
+        factors rounded to bfloat16), ``compile_loss`` (the gradient of the loss by ``torch.compile``),
+        ``packed_replay`` (minibatches from a float32 copy of the replay buffer; on CUDA by default)
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
-from sb3_tdc.tdc.fused.replay import DeviceReplay
+from sb3_tdc.tdc.fused.replay import PackedReplay
 from tests.tdc.test_fused import assert_close, states
 from tests.tdc.test_tdc import HEADS, make
 from tests.tdc.test_update import BatchQueue, TwoActions, make_model, random_batches
@@ -112,11 +113,11 @@ def test_a_change_of_what_is_captured_makes_new_graphs():
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_device_replay_returns_what_the_buffer_returns(n_envs):
+def test_packed_replay_returns_what_the_buffer_returns(n_envs):
     """While it fills, wraps around, and stands full; bit for bit, from the same random numbers."""
     env, rng = TwoActions(), np.random.default_rng(0)
     buffer = ReplayBuffer(10 * n_envs, env.observation_space, env.action_space, "cpu", n_envs=n_envs)
-    device_replay, steps = DeviceReplay(buffer, batch_size=20), 0
+    packed_replay, steps = PackedReplay(buffer, batch_size=20), 0
     for added in (1, 3, 4, 2, 1, 0, 9, 5, 10, 3, 27):  # full exactly at the fourth
         for _ in range(added):
             observation, next_observation = rng.normal(size=(2, n_envs, 3))
@@ -128,17 +129,30 @@ def test_device_replay_returns_what_the_buffer_returns(n_envs):
         np.random.seed(added)
         expected = buffer.sample(20)
         np.random.seed(added)
-        for name, got, want in zip(expected._fields, device_replay.sample(steps), expected, strict=True):
+        for name, got, want in zip(expected._fields, packed_replay.sample(steps), expected, strict=True):
             assert got is want is None or th.equal(got, want.float()), (added, name)
 
 
-def test_where_device_replay_applies():
+@HEADS
+def test_learning_from_packed_replay_is_the_same(stochastic_actor):
+    """Two environments, a buffer that wraps around, a second ``learn()``, fewer updates than steps."""
+    models = []
+    for packed_replay in (False, True):
+        env = make_vec_env(TwoActions, n_envs=2, seed=0)
+        kwargs = {"buffer_size": 60, "train_freq": 3, "gradient_steps": 2, "stochastic_actor": stochastic_actor}
+        model = make(env, fused_kwargs={"packed_replay": packed_replay}, **kwargs).learn(150).learn(100)
+        assert (model._fused_update.packed_replay is not None) is packed_replay
+        models.append(model)
+    assert_close(*map(states, models), rtol=0, atol=0)
+
+
+def test_where_packed_replay_applies():
     model = make()
-    assert DeviceReplay.applies(model.replay_buffer)
-    assert not DeviceReplay.applies(make(n_steps=3).replay_buffer)
+    assert PackedReplay.applies(model.replay_buffer)
+    assert not PackedReplay.applies(make(n_steps=3).replay_buffer)
     replay_buffer_kwargs = {"handle_timeout_termination": False}
     lean = make(optimize_memory_usage=True, replay_buffer_kwargs=replay_buffer_kwargs)
-    assert not DeviceReplay.applies(lean.replay_buffer)
+    assert not PackedReplay.applies(lean.replay_buffer)
 
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
@@ -147,7 +161,7 @@ def test_on_a_gpu(stochastic_actor):
     """Graphs against the readable update there; random numbers come in another order, so after learning, roughly."""
     model = make(TwoActions(), fused=True, device="cuda", stochastic_actor=stochastic_actor).learn(300)
     assert isinstance(model._fused_update.run, CudaGraphs)
-    assert model._fused_update.device_replay is not None
+    assert model._fused_update.packed_replay is not None
     assert len(model._fused_update.run._graphs) == 3
     assert all(weight.isfinite().all() for weight in model.policy.state_dict().values())
     eager = make(TwoActions(), fused=True, device="cuda", stochastic_actor=stochastic_actor).learn(60)

@@ -1,4 +1,4 @@
-"""A replay buffer's transitions on the device."""
+"""A replay buffer's transitions in one place."""
 
 import numpy as np
 import torch as th
@@ -6,10 +6,11 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 
-class DeviceReplay:
+class PackedReplay:
     """
     The transitions of a ``ReplayBuffer`` as float32 rows [s | a | s' | r | d] on the device, so that a minibatch is one
-    ``index_select`` there. Rows that the buffer has got since are copied when a minibatch is drawn.
+    ``index_select`` there. Rows that the buffer has got since are copied when a minibatch is drawn; what is changed in
+    the buffer afterwards is not seen.
 
     :param buffer: for which :meth:`applies`
     :param batch_size: B

@@ -12,7 +12,7 @@ from sb3_tdc.tdc.fused.applicability import has_hooks, is_plain_adam
 from sb3_tdc.tdc.fused.flat_adam import FlatAdam
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
 from sb3_tdc.tdc.fused.networks import DeterministicHead, Layer, Mlp, TanhGaussianHead, make_layers, relu_backward
-from sb3_tdc.tdc.fused.replay import DeviceReplay
+from sb3_tdc.tdc.fused.replay import PackedReplay
 from sb3_tdc.tdc.quantiles import QuantileHuberGradient, Target, lcb_target
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class FusedUpdate:
         self.actor_adam = FlatAdam(model.actor, model.actor_target)
         self.constants = self._read_constants()
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
-        self.device_replay: DeviceReplay | None = None
+        self.packed_replay: PackedReplay | None = None
         obs_dim = model.policy.actor.features_dim
         action_dim = get_action_dim(model.critic.action_space)
 
@@ -104,11 +104,12 @@ class FusedUpdate:
         """:return: a minibatch of the model's replay buffer"""
         model = self.model
         buffer, normalization = model.replay_buffer, model._vec_normalize_env
-        if model.device.type == "cpu" or normalization is not None or not DeviceReplay.applies(buffer):
+        packed = model.fused_kwargs.get("packed_replay", model.device.type == "cuda")
+        if not packed or normalization is not None or not PackedReplay.applies(buffer):
             return buffer.sample(batch_size, env=normalization)
-        if self.device_replay is None or self.device_replay.buffer is not buffer:
-            self.device_replay = DeviceReplay(buffer, batch_size)
-        return self.device_replay.sample(model.num_timesteps // model.n_envs)
+        if self.packed_replay is None or self.packed_replay.buffer is not buffer:
+            self.packed_replay = PackedReplay(buffer, batch_size)
+        return self.packed_replay.sample(model.num_timesteps // model.n_envs)
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
