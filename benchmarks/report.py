@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 _TDC = "TDC"
+_OTHER_PAIRS = ("SB3 TD3 / TDC, readable update", "SB3 SAC / TDC, stochastic head")
 
 
 def ratios(times: list[float], reference: list[float]) -> np.ndarray:
@@ -29,15 +30,14 @@ def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float |
         *(f"ms, {n}t" for n in threads),
     ]
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for peer in results[threads[0]]["steps"]:
+    for peer in [*results[threads[0]]["steps"], *_OTHER_PAIRS]:
+        numerator, _, denominator = peer.partition(" / ")
         cells = [peer]
         for n in threads:
             steps = results[n]["steps"]
-            reference = steps["TDC, stochastic head"] if peer == "SB3 SAC" else steps[_TDC]
-            cells.append("1" if peer == _TDC else quartiles(ratios(steps[peer], reference)))
-        asked = [f"{targets[peer, int(n)]} ({n}t)" for n in threads if targets.get((peer, int(n)))]
-        cells.append(", ".join(asked))
-        cells += [f"{np.median(results[n]['steps'][peer]):.1f}" for n in threads]
+            cells.append("1" if peer == _TDC else quartiles(ratios(steps[numerator], steps[denominator or _TDC])))
+        cells.append(", ".join(f"{targets[peer, int(n)]} ({n}t)" for n in threads if (peer, int(n)) in targets))
+        cells += ["" if denominator else f"{np.median(results[n]['steps'][peer]):.1f}" for n in threads]
         lines.append("| " + " | ".join(cells) + " |")
     gradient = [results[n]["gradient"] for n in threads]
     cells = ["gradient step / its matrix products alone"]
@@ -45,7 +45,25 @@ def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float |
     cells += ["≤ 1.6", *(f"{np.median(g[_TDC]):.1f}" for g in gradient)]
     lines.append("| " + " | ".join(cells) + " |")
     load = ", ".join(f"{results[n]['foreign_load']:.2f} ({n}t)" for n in threads)
-    return [*lines, "", f"Load by other processes meanwhile, in cores: {load}."]
+    return [*lines, "", f"Load by other processes meanwhile, in cores: {load}.", *errors_of_options(results)]
+
+
+def errors_of_options(results: dict[str, Any]) -> list[str]:
+    """What the options of ``fused_kwargs`` do to a gradient."""
+    errors = next(iter(results.values()))["errors"]
+    if not errors:
+        return []
+    cells = [f"{name}: critics {e['critics']:.1e}, actor {e['actor']:.1e}" for name, e in errors.items()]
+    return ["", f"Relative error of the gradients of one update with an option: {'; '.join(cells)}."]
+
+
+def table_of_runs(together: list[dict[str, Any]]) -> list[str]:
+    """Steps per second of all runs together, against runs and threads."""
+    lines = ["| runs at once | threads each | steps/s of all together (each turn) |", "|---|---|---|"]
+    for row in together:
+        turns = ", ".join(f"{rate:.0f}" for rate in row["rates"])
+        lines.append(f"| {row['runs']} | {row['threads']} | **{np.median(row['rates']):.0f}** ({turns}) |")
+    return lines
 
 
 def draw_scaling(scaling: dict[str, Any], path: Path) -> None:
@@ -81,7 +99,7 @@ def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str,
         "",
         f"{results['hardware']}. Whole environment steps (simulator, replay, one gradient step of batch 256, 256-256"
         " networks, float32), one gradient step a step. A ratio is the peer's time over TDC's (64 quantiles, fused"
-        f" update, deterministic head), SAC's over that of the stochastic head; median (quartiles) of"
+        f" update, deterministic head), where no other is named; median (quartiles) of"
         f" {results['rounds']} turns of {results['steps']} steps, taken in turn in one process. *2t*, *1t*: on two"
         " threads, on one thread of one core. *asked*: the aim set"
         " beforehand, for HalfCheetah-v4.",
@@ -90,6 +108,12 @@ def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str,
     for env_id, by_threads in results["envs"].items():
         lines += [f"## {env_id}", "", *table_of_env(by_threads, targets if "Cheetah" in env_id else {}), ""]
     lines += [
+        "## Runs at once",
+        "",
+        "TDC on HalfCheetah-v4, on all cores.",
+        "",
+        *table_of_runs(results["together"]),
+        "",
         "## Cost against quantiles, batch size and width",
         "",
         "Gradient steps on HalfCheetah-v4, all else as above, beside their matrix products alone (dotted).",

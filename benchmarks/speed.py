@@ -24,12 +24,14 @@ ENVS = ("HalfCheetah-v4", "Hopper-v4", "Humanoid-v4")
 TARGETS = {
     ("SB3 TD3", 2): 1.4,
     ("SB3 TD3", 1): 1.15,
+    ("SB3 TD3 / TDC, readable update", 2): 1.1,
+    ("SB3 SAC / TDC, stochastic head", 2): 1.8,
     ("contrib TQC, 64 quantiles", 2): 9.0,
     ("SBX TQC, 64 quantiles", 2): 4.8,
     ("SBX TD3", 2): 1.0,
     ("naive transcription", 2): 6.5,
-    ("TDC, readable update", 2): None,
 }
+OPTIONS = ("packed_replay", "compile_loss", "bfloat16")
 
 
 def make_models(env_id: str) -> dict[str, Any]:
@@ -57,6 +59,10 @@ def make_models(env_id: str) -> dict[str, Any]:
         "TDC": TDC(**settings(), device="cpu"),
         "TDC, readable update": TDC(**settings(), device="cpu", fused=False),
         "TDC, stochastic head": TDC(**settings(), device="cpu", stochastic_actor=True),
+        **{
+            f"TDC, {option}": TDC(**settings(), device="cpu", fused_kwargs={option: True})
+            for option in (OPTIONS if env_id == ENVS[0] else ())
+        },
         "SB3 TD3": TD3(**settings(), device="cpu", action_noise=noise),
         "SB3 SAC": SAC(**settings(), device="cpu"),
         "naive transcription": NaiveTDC(**{**settings(), "policy": NaivePolicy}, device="cpu", action_noise=noise),
@@ -151,7 +157,7 @@ def measure_env(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
     """Whole environment steps of every peer, then gradient steps of TDC beside its matrix products."""
     models = make_models(env_id)
     for model in models.values():
-        model.learn(420)
+        model.learn(340)
     learn = {name: lambda model=model: model.learn(steps, reset_num_timesteps=False) for name, model in models.items()}
     with Load() as load:
         step_times = time_calls(learn, rounds, dict.fromkeys(learn, 1))
@@ -161,8 +167,24 @@ def measure_env(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
     return {
         "steps": {name: [t / steps for t in times] for name, times in step_times.items()},
         "gradient": gradient_times,
+        "errors": {option: gradient_error(tdc, models[f"TDC, {option}"]) for option in OPTIONS if env_id == ENVS[0]},
         "foreign_load": load.foreign,
     }
+
+
+def gradient_error(exact: Any, other: Any) -> dict[str, float]:
+    """:return: ‖g' − g‖ / ‖g‖ of the gradients of one update with the same weights, batch and random numbers"""
+    import torch as th
+
+    other.set_parameters(exact.get_parameters())
+    data, gradients = exact.replay_buffer.sample(256), []
+    for model in (exact, other):
+        th.manual_seed(0)
+        update = model._bind_fused_update(256)
+        update.update_critics(data, 1.0)
+        update.update_actor(data)
+        gradients.append({"critics": update.critic_adam.gradient.clone(), "actor": update.actor_adam.gradient.clone()})
+    return {name: float((gradients[1][name] - g).norm() / g.norm()) for name, g in gradients[0].items()}
 
 
 def measure_scaling(rounds: int) -> dict[str, Any]:
@@ -206,8 +228,55 @@ def run_child(task: str, threads: int, arguments: argparse.Namespace) -> dict[st
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def run_together(runs: int, threads: int, seconds: float) -> float:
+    """:return: environment steps per second of some runs of TDC at once, all together, on all cores"""
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = {**os.environ, **dict.fromkeys(names, str(threads))}
+    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.speed", "--task", "rate", "--threads", str(threads)]
+    children = [
+        subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for _ in range(runs)
+    ]
+    for child in children:  # each says when it is warm, then waits for the length of the measurement
+        assert child.stdout is not None
+        child.stdout.readline()
+    for child in children:
+        assert child.stdin is not None
+        child.stdin.write(f"{seconds}\n")
+        child.stdin.flush()
+    return sum(float(child.communicate()[0]) for child in children)
+
+
+def measure_rate() -> None:
+    """The child of :func:`run_together`."""
+    from sb3_tdc import TDC
+
+    model = TDC("MlpPolicy", ENVS[0], learning_starts=300, buffer_size=50_000, device="cpu", seed=0).learn(340)
+    print("ready", flush=True)
+    seconds, steps = float(sys.stdin.readline()), 0
+    start = time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        model.learn(20, reset_num_timesteps=False)
+        steps += 20
+    print(steps / (time.perf_counter() - start))
+
+
+def measure_threads(rounds: int, seconds: float = 6.0) -> list[dict[str, Any]]:
+    """One run alone and as many as cores, with one thread each and with as many as cores."""
+    cores = os.cpu_count() or 1
+    settings = [(runs, threads) for runs in (1, cores) for threads in (1, cores)]
+    rates: dict[tuple[int, int], list[float]] = {setting: [] for setting in settings}
+    for _ in range(rounds):
+        for setting in settings:
+            rates[setting].append(run_together(*setting, seconds))
+    return [{"runs": runs, "threads": threads, "rates": rates[runs, threads]} for runs, threads in settings]
+
+
 def work(arguments: argparse.Namespace) -> None:
     """What a child does: pin itself, measure, print JSON."""
+    if arguments.task == "rate":
+        measure_rate()
+        return
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.threads])
     import torch as th
@@ -234,8 +303,8 @@ def hardware() -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"), help="folder of table and plots")
-    parser.add_argument("--rounds", type=int, default=12, help="turns of every peer")
-    parser.add_argument("--steps", type=int, default=30, help="environment steps a turn")
+    parser.add_argument("--rounds", type=int, default=8, help="turns of every peer")
+    parser.add_argument("--steps", type=int, default=25, help="environment steps a turn")
     parser.add_argument("--envs", nargs="+", default=ENVS)
     parser.add_argument("--task", help=argparse.SUPPRESS)
     parser.add_argument("--threads", type=int, nargs="+", default=[2, 1])
@@ -256,6 +325,8 @@ def main() -> None:
     for threads in arguments.threads:
         print(f"scaling, {threads} thread(s) ...", file=sys.stderr, flush=True)
         results.setdefault("scaling", {})[str(threads)] = run_child("scaling", threads, arguments)
+    print("several runs at once ...", file=sys.stderr, flush=True)
+    results["together"] = measure_threads(rounds=3)
     results["minutes"] = (time.perf_counter() - start) / 60
     write_report(results, arguments.output, TARGETS)
 

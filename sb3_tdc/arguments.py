@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
@@ -68,7 +69,7 @@ def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:
     """The flags that training and enjoying share, as in RL Zoo."""
     parser.add_argument("--algo", type=one_of("algorithm", algorithms), default="tdc", help="algorithm")
     parser.add_argument("-f", "--log-folder", "--folder", default="logs", help="folder of all runs")
-    parser.add_argument("--num-threads", type=int, default=-1, help="threads for PyTorch (-1: PyTorch's default)")
+    parser.add_argument("--num-threads", type=int, default=-1, help="threads for PyTorch (-1: two, if there are)")
     parser.add_argument("--device", default="auto", help="PyTorch device (cpu, cuda, ...)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
     parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the environment")
@@ -94,4 +95,6 @@ def apply_common_arguments(args: argparse.Namespace, env_id: str) -> str:
             ) from error
     if args.num_threads > 0:
         th.set_num_threads(args.num_threads)
+    elif "OMP_NUM_THREADS" not in os.environ:  # networks of this size gain nothing from more
+        th.set_num_threads(min(2, th.get_num_threads()))
     return env_id

@@ -15,7 +15,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_tdc import TDC, enjoy, train
-from sb3_tdc.arguments import Parser
+from sb3_tdc.arguments import Parser, apply_common_arguments
 from sb3_tdc.interruption import StopOnSignal
 from sb3_tdc.run_folder import RunFolder
 
@@ -38,6 +38,23 @@ def tags(folder):
     (events,) = Path(folder).glob("events.out.tfevents.*")
     accumulator = EventAccumulator(str(events)).Reload()
     return accumulator, set(accumulator.Tags()["scalars"])
+
+
+@pytest.mark.parametrize(
+    ("available", "asked", "variable", "expected"),
+    [(16, -1, None, 2), (1, -1, None, 1), (16, 5, None, 5), (16, -1, "7", 16), (16, 3, "7", 3)],
+)
+def test_threads(monkeypatch, available, asked, variable, expected):
+    """Two by default; what the user says, on the command line or in the environment, counts."""
+    threads = [available]
+    monkeypatch.setattr(th, "get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr(th, "set_num_threads", threads.append)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if variable:
+        monkeypatch.setenv("OMP_NUM_THREADS", variable)
+    args = train.make_parser().parse_args(["--num-threads", str(asked)])
+    apply_common_arguments(args, "Hopper-v4")
+    assert threads[-1] == expected
 
 
 def test_a_run_leaves_what_rl_zoo_leaves(tmp_path, capsys):
