@@ -2,7 +2,8 @@
 
 from importlib.metadata import version
 
+from sb3_tdc.safe_load import UnsafeFileError, load_safely
 from sb3_tdc.tdc import TDC, NonFiniteError
 
 __version__ = version("sb3-tdc")
-__all__ = ["TDC", "NonFiniteError", "__version__"]
+__all__ = ["TDC", "NonFiniteError", "UnsafeFileError", "__version__", "load_safely"]

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments
-from sb3_tdc.experiment import ALGORITHMS, check_env_id, check_saved_by, make_envs
+from sb3_tdc.experiment import ALGORITHMS, check_env_id, load_model, make_envs
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.rendering import VideoWriter, choose_gl_backend, follow_agent, has_display
 from sb3_tdc.run_folder import RunFolder
@@ -40,6 +40,7 @@ def make_parser() -> Parser:
     add("--no-render", action="store_true", help="no picture, only returns")
     add("--stochastic", action="store_true", help="sampled instead of mean actions (SAC; TDC always takes the mean)")
     add("--seed", type=int, default=0, help="seed of the environment")
+    add("--trust", action="store_true", help="let the files run code, as SB3 does: only for those you know the origin of")
     add("--verbose", type=int, default=1, help="0: only the result, 1: every episode")
     return parser
 
@@ -155,6 +156,8 @@ def _render_mode(args: argparse.Namespace, env_id: str) -> str | None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.trust:
+        print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
     trained = find_trained(args)
     check_env_id(trained.env_id)
     set_random_seed(args.seed)
@@ -169,12 +172,12 @@ def _run(args: argparse.Namespace) -> int:
             env_kwargs={**trained.env_kwargs, **args.env_kwargs, "render_mode": render_mode},
             normalization=trained.normalization,
             training=False,
+            trust=args.trust,
         )
         stack.callback(env.close)
         for unwrapped in env.get_attr("unwrapped"):
             follow_agent(unwrapped)
-        check_saved_by(trained.path, trained.algo)
-        model = ALGORITHMS[trained.algo].load(trained.path, env=env, device=args.device, buffer_size=1)
+        model = load_model(trained.path, trained.algo, env, args.trust, device=args.device, buffer_size=1)
         env.seed(args.seed)  # loading has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")
         video = None

@@ -40,6 +40,7 @@ from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.interruption import StopOnSignal, StoppableEvaluation, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, save_model
+from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely
 from sb3_tdc.tdc import TDC
 
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "td3": TD3, "sac": SAC, "ddpg": DDPG}
@@ -57,6 +58,7 @@ class Experiment:
     :param save_freq: environment steps between saved models; 0 or less: none
     :param tensorboard_log: "" for none; None for the run's own folder
     :param trained_model: a zip to go on from; its replay buffer and normalisation are loaded if they lie beside it
+    :param trust: whether ``trained_model`` and what lies beside it may run code, as SB3's ``load`` lets them
     :param log_interval: episodes between log entries; None for none
     """
 
@@ -76,6 +78,7 @@ class Experiment:
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
     tensorboard_log: str | None = None
     trained_model: Path | None = None
+    trust: bool = False
     log_interval: int | None = 4
     progress_bar: bool = False
     verbose: int = 1
@@ -119,6 +122,7 @@ def make_envs(
     monitor_folder: Path | None = None,
     normalization: Path | None = None,
     training: bool = True,
+    trust: bool = False,
 ) -> VecEnv:
     """
     The environments of a run, wrapped as its hyperparameters say.
@@ -128,6 +132,7 @@ def make_envs(
     :param monitor_folder: for ``*.monitor.csv``
     :param normalization: saved statistics for ``VecNormalize``
     :param training: False: statistics stay as they are and rewards are not normalised
+    :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
     """
     spec = gym.spec(env_id)
 
@@ -154,7 +159,7 @@ def make_envs(
         env = VecFrameStack(env, hyperparams.frame_stack)
     if hyperparams.normalize is not None:
         if normalization is not None:
-            env = VecNormalize.load(str(normalization), env)
+            env = VecNormalize.load(str(normalization), env) if trust else load_normalization(normalization, env)
         else:
             env = VecNormalize(env, **hyperparams.normalize)
         if not training:
@@ -171,8 +176,6 @@ def train(experiment: Experiment) -> Outcome:
     """
     with ExitStack() as stack:
         try:
-            if experiment.trained_model is not None:
-                check_saved_by(experiment.trained_model, experiment.algo)
             env = stack.enter_context(_closing(_make_training_envs(experiment)))
             model = _make_model(experiment, env)
             model.set_logger(_make_logger(experiment))
@@ -220,6 +223,7 @@ def _make_training_envs(experiment: Experiment) -> VecEnv:
         experiment.vec_env,
         monitor_folder=experiment.folder.path,
         normalization=normalization,
+        trust=experiment.trust,
     )
 
 
@@ -247,11 +251,14 @@ def _make_model(experiment: Experiment, env: VecEnv) -> OffPolicyAlgorithm:
 
     for of_the_saved_model in ("policy", "policy_kwargs"):
         kwargs.pop(of_the_saved_model, None)
-    model = algorithm.load(experiment.trained_model, env=env, **kwargs)
+    model = load_model(experiment.trained_model, experiment.algo, env, experiment.trust, **kwargs)
     run = RunFolder(experiment.trained_model.parent, experiment.folder.env_name)
     replay_buffer = run.replay_buffer(experiment.trained_model)
     if replay_buffer.exists():
-        model.load_replay_buffer(replay_buffer)
+        if experiment.trust:
+            model.load_replay_buffer(replay_buffer)
+        else:
+            load_replay_buffer(replay_buffer, model)
         assert model.replay_buffer is not None
         if model.replay_buffer.n_envs != env.num_envs:
             raise ValueError(
@@ -259,6 +266,19 @@ def _make_model(experiment: Experiment, env: VecEnv) -> OffPolicyAlgorithm:
             )
         model.learning_starts = 0  # no random steps on top of the experience that is there
     return model
+
+
+def load_model(path: Path, algo: str, env: VecEnv, trust: bool, **kwargs: Any) -> OffPolicyAlgorithm:
+    """
+    :param algo: a key of ``ALGORITHMS``
+    :param trust: whether the file may run code, as SB3's ``load`` lets it
+    :param kwargs: those of the algorithm's ``load``
+    :raises ValueError: if a file is not a saved model, is one of another algorithm, or is refused
+    """
+    if trust:
+        check_saved_by(path, algo)
+        return ALGORITHMS[algo].load(path, env=env, **kwargs)
+    return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
 
 
 def check_saved_by(path: Path, algo: str) -> None:

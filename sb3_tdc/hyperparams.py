@@ -38,7 +38,7 @@ _RUN_KEYS: dict[str, Any] = {
 # Keyword arguments that belong to one run, not to an environment: train.py has flags for them
 _FLAGS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 # What the algorithm itself passes to the policy
-_POLICY_ARGUMENTS = {"self", "observation_space", "action_space", "lr_schedule"}
+POLICY_ARGUMENTS = {"self", "observation_space", "action_space", "lr_schedule"}
 # Where a class may be named without its module
 _CLASS_MODULES = ("torch.nn", "torch.optim", "stable_baselines3", "stable_baselines3.common.buffers")
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
@@ -186,7 +186,7 @@ def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], wher
             raise ValueError(f"{where}: unknown policy {policy!r}{suggest(policy, algorithm.policy_aliases)}")
         policy = algorithm.policy_aliases[policy]
     if values.get("policy_kwargs"):
-        hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in _POLICY_ARGUMENTS}
+        hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in POLICY_ARGUMENTS}
         values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, f"{where}: policy_kwargs")
 
 

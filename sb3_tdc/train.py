@@ -29,6 +29,7 @@ def make_parser() -> Parser:
     add("-n", "--n-timesteps", type=int, default=-1, help="environment steps (-1: as in the hyperparameters)")
     add("--seed", type=int, default=-1, help="seed of all generators (-1: a random one)")
     add("-i", "--trained-agent", type=Path, help="zip of a model to go on from")
+    add("--trust", action="store_true", help="let the files of -i run code, as SB3 does")
     add("--eval-freq", type=int, default=20_000, help="evaluate every so many steps (-1: never)")
     add("--eval-episodes", type=int, default=5, help="episodes per evaluation")
     add("--n-eval-envs", type=int, default=1, help="environments for evaluation")
@@ -109,6 +110,7 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
         eval_env_kwargs=args.eval_env_kwargs,
         tensorboard_log=args.tensorboard_log,
         trained_model=args.trained_agent,
+        trust=args.trust,
         log_interval=4 if args.log_interval == -1 else max(args.log_interval, 0) or None,
         progress_bar=progress_bar,
         verbose=args.verbose,

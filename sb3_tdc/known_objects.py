@@ -1,0 +1,237 @@
+"""The objects that a saved model may hold: what each name of a file stands for, and how it is made from plain data."""
+
+import math
+import re
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+
+from sb3_tdc.inert_pickle import Call, Name, Rebuild, UnsafeFileError
+from sb3_tdc.tdc.checks import check_integer, check_number
+
+MAX_DIMENSIONS = 8
+
+
+def name_of(cls: type) -> Name:
+    """:return: what a pickle calls a class"""
+    return Name(cls.__module__, cls.__qualname__)
+
+
+# Each is called without arguments, or by the policy with its own
+CLASSES: dict[Name, type] = {
+    name_of(cls): cls
+    for cls in (
+        *(getattr(th.nn.modules.activation, name) for name in th.nn.modules.activation.__all__),
+        *(th.optim.Adam, th.optim.AdamW, th.optim.Adamax, th.optim.NAdam, th.optim.RAdam, th.optim.RMSprop),
+        *(th.optim.SGD, RMSpropTFLike),
+        *(FlattenExtractor, NatureCNN, CombinedExtractor),
+        *(ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer),
+        *(np.float32, np.float64),
+    )
+}
+
+
+def _state(call: Call) -> dict[str, Any]:
+    if not isinstance(call.state, dict):
+        raise UnsafeFileError(f"a {call.function} without its attributes")
+    return call.state
+
+
+def _attributes(call: Call, make: Rebuild, *names: str) -> list[Any]:
+    """Some attributes of an object, in order; the others are never looked at."""
+    state = _state(call)
+    missing = [name for name in names if name not in state]
+    if missing:
+        raise UnsafeFileError(f"a {call.function} without {missing[0]}")
+    return [make(state[name]) for name in names]
+
+
+def _arguments(call: Call, make: Rebuild, n: int) -> list[Any]:
+    if not isinstance(call.args, tuple) or len(call.args) < n:
+        raise UnsafeFileError(f"a call of {call.function} without its arguments")
+    return [make(argument) for argument in call.args[:n]]
+
+
+# -------------------------------------------------------------------- numpy
+
+
+def _dtype(call: Call, make: Rebuild) -> np.dtype:
+    (name,) = _arguments(call, make, 1)
+    order = call.state[1] if isinstance(call.state, tuple) and len(call.state) > 1 else "="
+    if not isinstance(name, str) or not re.fullmatch(r"b1|[iu][1248]|f[248]", name) or order not in ("<", "|", "="):
+        raise UnsafeFileError("an array of something else than numbers")
+    return np.dtype(name)
+
+
+def _array(raw: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
+    """:return: (shape), writable; there must be as many bytes as it takes"""
+    sizes = shape if isinstance(shape, tuple) else ()
+    whole = isinstance(shape, tuple) and all(type(size) is int and size >= 0 for size in sizes)
+    if not isinstance(raw, (bytes, bytearray)) or not isinstance(dtype, np.dtype) or not whole:
+        raise UnsafeFileError("a damaged array")
+    if len(sizes) > MAX_DIMENSIONS or math.prod(sizes) * dtype.itemsize != len(raw):
+        raise UnsafeFileError(f"an array of {len(raw):,} bytes that says it is {sizes}"[:200])
+    array = np.frombuffer(raw, dtype).reshape(sizes, order="F" if order == "F" else "C")
+    return array if isinstance(raw, bytearray) else array.copy()  # a replay buffer's gigabytes are not copied
+
+
+def _array_of_state(call: Call, make: Rebuild) -> np.ndarray:
+    if not isinstance(call.state, tuple) or len(call.state) != 5:
+        raise UnsafeFileError("a damaged array")
+    _, shape, dtype, fortran_order, raw = (make(part) for part in call.state)
+    return _array(raw, dtype, shape, "F" if fortran_order else "C")
+
+
+def _array_of_buffer(call: Call, make: Rebuild) -> np.ndarray:
+    return _array(*_arguments(call, make, 4))
+
+
+def _scalar(call: Call, make: Rebuild) -> Any:
+    dtype, raw = _arguments(call, make, 2)
+    return _array(raw, dtype, (), "C").item()
+
+
+# -------------------------------------------------------------------- spaces
+
+
+def _box(call: Call, make: Rebuild) -> spaces.Box:
+    low, high = _attributes(call, make, "low", "high")
+    if not (isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and low.shape == high.shape):
+        raise UnsafeFileError("a Box without bounds of one shape")
+    return spaces.Box(low, high, dtype=low.dtype.type)
+
+
+def _dict_space(call: Call, make: Rebuild) -> spaces.Dict:
+    (of_keys,) = _attributes(call, make, "spaces")
+    if not isinstance(of_keys, dict) or not all(isinstance(key, str) for key in of_keys):
+        raise UnsafeFileError("a Dict space without its spaces")
+    return spaces.Dict(OrderedDict(of_keys))
+
+
+def _discrete(call: Call, make: Rebuild) -> spaces.Discrete:
+    (n,) = _attributes(call, make, "n")
+    start = make(_state(call).get("start", 0))
+    return spaces.Discrete(check_integer("n of a Discrete space", n, 1), start=start)
+
+
+def _multi_discrete(call: Call, make: Rebuild) -> spaces.MultiDiscrete:
+    return spaces.MultiDiscrete(*_attributes(call, make, "nvec"))
+
+
+def _multi_binary(call: Call, make: Rebuild) -> spaces.MultiBinary:
+    (n,) = _attributes(call, make, "n")
+    return spaces.MultiBinary(check_integer("n of a MultiBinary space", n, 1))
+
+
+# -------------------------------------------------------------------- what a run was set up with
+
+
+def _normal_noise(call: Call, make: Rebuild) -> NormalActionNoise:
+    return NormalActionNoise(*_noise_arrays(call, make))
+
+
+def _ornstein_uhlenbeck_noise(call: Call, make: Rebuild) -> OrnsteinUhlenbeckActionNoise:
+    theta, dt, initial = _attributes(call, make, "_theta", "_dt", "initial_noise")
+    if initial is not None and not isinstance(initial, np.ndarray):
+        raise UnsafeFileError("initial noise that is not an array")
+    return OrnsteinUhlenbeckActionNoise(
+        *_noise_arrays(call, make), check_number("theta", theta), check_number("dt", dt), initial
+    )
+
+
+def _noise_arrays(call: Call, make: Rebuild) -> tuple[np.ndarray, np.ndarray]:
+    mean, sigma = (np.asarray(value, dtype=float) for value in _attributes(call, make, "_mu", "_sigma"))
+    if not (np.isfinite(mean).all() and np.isfinite(sigma).all()):
+        raise UnsafeFileError("noise that is not finite")
+    return mean, sigma
+
+
+def _base_noise(call: Call, make: Rebuild) -> Any:
+    # learn() makes it noise of several environments again, of as many as there are
+    return _attributes(call, make, "_base_noise")[0]
+
+
+def _linear_schedule(call: Call, make: Rebuild) -> LinearSchedule:
+    names = ("start", "end", "end_fraction")
+    values = _attributes(call, make, *names)
+    return LinearSchedule(*(check_number(name, value) for name, value in zip(names, values, strict=True)))
+
+
+def _zoo_schedule(call: Call, make: Rebuild) -> LinearSchedule:
+    (initial,) = _attributes(call, make, "initial_value")
+    return LinearSchedule(check_number("initial_value", initial), 0.0, 1.0)
+
+
+def _constant_schedule(call: Call, make: Rebuild) -> ConstantSchedule:
+    return ConstantSchedule(check_number("val", *_attributes(call, make, "val")))
+
+
+def _float_schedule(call: Call, make: Rebuild) -> FloatSchedule:
+    (schedule,) = _attributes(call, make, "value_schedule")
+    if not isinstance(schedule, (LinearSchedule, ConstantSchedule)):
+        raise UnsafeFileError("a schedule of something else than a schedule")
+    return FloatSchedule(schedule)
+
+
+def _train_freq(call: Call, make: Rebuild) -> TrainFreq:
+    frequency, unit = _arguments(call, make, 2)
+    if not isinstance(unit, TrainFrequencyUnit):
+        raise UnsafeFileError("a train_freq without its unit")
+    return TrainFreq(check_integer("frequency", frequency, 1), unit)
+
+
+def _ordered_dict(call: Call, make: Rebuild) -> dict[Any, Any]:
+    return {key: make(item) for key, item in call.items}
+
+
+def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
+    mean, var, count = _attributes(call, make, "mean", "var", "count")
+    statistics = RunningMeanStd()
+    statistics.mean, statistics.var = np.asarray(mean, dtype=np.float64), np.asarray(var, dtype=np.float64)
+    statistics.count = check_number("count", count, 0.0)
+    finite = np.isfinite(statistics.mean).all() and np.isfinite(statistics.var).all()
+    if not finite or (statistics.var < 0).any() or statistics.mean.shape != statistics.var.shape:
+        raise UnsafeFileError("statistics that are not finite means and variances of one shape")
+    return statistics
+
+
+_SB3 = "stable_baselines3.common"
+CALLS: dict[Name, Callable[[Call, Rebuild], Any]] = {
+    Name("collections", "OrderedDict"): _ordered_dict,
+    Name("numpy", "dtype"): _dtype,
+    # numpy 2 moved what numpy 1 had in numpy.core
+    **{Name(f"numpy.{core}.multiarray", "_reconstruct"): _array_of_state for core in ("core", "_core")},
+    **{Name(f"numpy.{core}.multiarray", "scalar"): _scalar for core in ("core", "_core")},
+    **{Name(f"numpy.{core}.numeric", "_frombuffer"): _array_of_buffer for core in ("core", "_core")},
+    # gymnasium was gym
+    **{Name(f"{gym}.spaces.box", "Box"): _box for gym in ("gym", "gymnasium")},
+    **{Name(f"{gym}.spaces.dict", "Dict"): _dict_space for gym in ("gym", "gymnasium")},
+    **{Name(f"{gym}.spaces.discrete", "Discrete"): _discrete for gym in ("gym", "gymnasium")},
+    **{Name(f"{gym}.spaces.multi_discrete", "MultiDiscrete"): _multi_discrete for gym in ("gym", "gymnasium")},
+    **{Name(f"{gym}.spaces.multi_binary", "MultiBinary"): _multi_binary for gym in ("gym", "gymnasium")},
+    Name(f"{_SB3}.noise", "NormalActionNoise"): _normal_noise,
+    Name(f"{_SB3}.noise", "OrnsteinUhlenbeckActionNoise"): _ornstein_uhlenbeck_noise,
+    Name(f"{_SB3}.noise", "VectorizedActionNoise"): _base_noise,
+    Name(f"{_SB3}.utils", "LinearSchedule"): _linear_schedule,
+    Name(f"{_SB3}.utils", "ConstantSchedule"): _constant_schedule,
+    Name(f"{_SB3}.utils", "FloatSchedule"): _float_schedule,
+    Name("rl_zoo3.utils", "SimpleLinearSchedule"): _zoo_schedule,
+    Name(f"{_SB3}.type_aliases", "TrainFreq"): _train_freq,
+    Name(f"{_SB3}.type_aliases", "TrainFrequencyUnit"): lambda call, make: TrainFrequencyUnit(
+        *_arguments(call, make, 1)
+    ),
+    name_of(GoalSelectionStrategy): lambda call, make: GoalSelectionStrategy(*_arguments(call, make, 1)),
+    Name(f"{_SB3}.running_mean_std", "RunningMeanStd"): _running_mean_std,
+}
