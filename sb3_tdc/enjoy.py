@@ -40,7 +40,11 @@ def make_parser() -> Parser:
     add("--no-render", action="store_true", help="no picture, only returns")
     add("--stochastic", action="store_true", help="sampled instead of mean actions (SAC; TDC always takes the mean)")
     add("--seed", type=int, default=0, help="seed of the environment")
-    add("--trust", action="store_true", help="let the files run code, as SB3 does: only for those you know the origin of")
+    add(
+        "--trust",
+        action="store_true",
+        help="let the files run code, as SB3 does: only if you know their origin",
+    )
     add("--verbose", type=int, default=1, help="0: only the result, 1: every episode")
     return parser
 
@@ -76,6 +80,30 @@ def find_model(args: argparse.Namespace, run: RunFolder) -> Path:
     return path
 
 
+# What of a run's hyperparameters the environments are made of
+_OF_THE_ENVIRONMENT = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper", "env_kwargs")
+_WRAPPER_PACKAGES = (
+    "gymnasium.wrappers", "stable_baselines3.common", "sb3_contrib.common", "rl_zoo3.wrappers",
+)  # fmt: skip
+
+
+def _check_imports(run: RunFolder, gym_packages: Sequence[str]) -> None:
+    """:raises ValueError: if the files of a run name code to import that the user has not named"""
+    package, _, _ = run.args["env"].rpartition(":")
+    for name in [*run.args["gym_packages"], *([package] if package else [])]:
+        if name not in gym_packages:
+            raise ValueError(f"{run.path} asks for the package {name}: if you know it, add --gym-packages {name}")
+    allowed = (*_WRAPPER_PACKAGES, *gym_packages)
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        wrappers = run.config.get(key) or []
+        for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
+            for name in wrapper if isinstance(wrapper, dict) else [wrapper]:
+                if not any(str(name).startswith(f"{prefix}.") for prefix in allowed):
+                    raise ValueError(
+                        f"{run.path} asks for {key} {name}: if you know it, add --gym-packages and its module"
+                    )
+
+
 @dataclass
 class Trained:
     """A model to load, and what it was trained with."""
@@ -105,15 +133,21 @@ def find_trained(args: argparse.Namespace) -> Trained:
         run = find_run(args)
         path = find_model(args, run)
     trained = run.args
+    if not args.trust:
+        _check_imports(run, args.gym_packages)
     args.gym_packages = [*trained["gym_packages"], *args.gym_packages]
     apply_common_arguments(args, trained["env"])
-    hyperparams = parse(run.config, ALGORITHMS[trained["algo"]], str(run.path / run.env_name / "config.yml"))
+    config = {key: value for key, value in run.config.items() if key in _OF_THE_ENVIRONMENT}
+    where = str(run.path / run.env_name / "config.yml")
+    hyperparams = parse({"n_timesteps": 1, **config}, ALGORITHMS[trained["algo"]], where)
     normalization = None
     if hyperparams.normalize is not None:
         normalization = run.normalization(path)
+        if not normalization.is_file():  # RL Zoo keeps one for all its models
+            normalization = run.normalization(run.model)
         if not normalization.is_file():
             raise ValueError(f"{normalization} is missing: {path.name} was trained on normalised observations")
-    return Trained(path, trained["algo"], trained["env"], hyperparams, trained["env_kwargs"], normalization)
+    return Trained(path, trained["algo"], trained["env"], hyperparams, trained["env_kwargs"] or {}, normalization)
 
 
 def play(model: BaseAlgorithm, env: VecEnv, args: argparse.Namespace, video: VideoWriter | None) -> list[float]:

@@ -1,10 +1,8 @@
 """One run: environments, model, callbacks, run folder. Called by the command line, by searches and by tests."""
 
 import difflib
-import json
 import shutil
 import sys
-import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -40,7 +38,7 @@ from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.interruption import StopOnSignal, StoppableEvaluation, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, save_model
-from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely
+from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely, read_data
 from sb3_tdc.tdc import TDC
 
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "td3": TD3, "sac": SAC, "ddpg": DDPG}
@@ -176,6 +174,8 @@ def train(experiment: Experiment) -> Outcome:
     """
     with ExitStack() as stack:
         try:
+            if experiment.trained_model is not None:
+                check_saved_by(experiment.trained_model, experiment.algo)
             env = stack.enter_context(_closing(_make_training_envs(experiment)))
             model = _make_model(experiment, env)
             model.set_logger(_make_logger(experiment))
@@ -275,19 +275,16 @@ def load_model(path: Path, algo: str, env: VecEnv, trust: bool, **kwargs: Any) -
     :param kwargs: those of the algorithm's ``load``
     :raises ValueError: if a file is not a saved model, is one of another algorithm, or is refused
     """
+    check_saved_by(path, algo)
     if trust:
-        check_saved_by(path, algo)
         return ALGORITHMS[algo].load(path, env=env, **kwargs)
     return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
 
 
 def check_saved_by(path: Path, algo: str) -> None:
     """:raises ValueError: if a file is not a saved model, or is one of another algorithm"""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            module = json.loads(archive.read("data"))["policy_class"]["__module__"]
-    except (OSError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not the zip of a saved model") from error
+    policy_class = read_data(path).get("policy_class")
+    module = policy_class.get("__module__") if isinstance(policy_class, dict) else None
     modules = {a: {p.__module__ for p in ALGORITHMS[a].policy_aliases.values()} for a in ALGORITHMS}
     others = [a for a in ALGORITHMS if module in modules[a]]
     if others and algo not in others:

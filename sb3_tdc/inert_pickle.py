@@ -87,6 +87,7 @@ def _run(data: bytes | IO[bytes]) -> Any:
         items, stack = stack, marks.pop()
         return items
 
+    argument: Any
     for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
         name = opcode.name
         if count > MAX_OPCODES:
@@ -225,4 +226,3 @@ def _make(
     if isinstance(part, (list, tuple, set)):
         return type(part)(make(item) for item in part)
     raise UnsafeFileError(f"a {type(part).__name__}")
-

@@ -83,12 +83,12 @@ class RunFolder:
     @property
     def config(self) -> dict[str, Any]:
         """The hyperparameters as they were read."""
-        return yaml.safe_load((self.path / self.env_name / "config.yml").read_text())
+        return _read_yaml(self.path / self.env_name / "config.yml")
 
     @property
     def args(self) -> dict[str, Any]:
         """The command line arguments."""
-        return yaml.safe_load((self.path / self.env_name / "args.yml").read_text())
+        return _read_yaml(self.path / self.env_name / "args.yml")
 
     def checkpoints(self) -> dict[int, Path]:
         """:return: the model of every checkpoint, by timestep, oldest first"""
@@ -127,6 +127,32 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
     beside = path.with_name(f".{path.stem}.part.zip")
     model.save(beside)
     os.replace(beside, path)
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML of plain values, and the ordered mappings and tuples that RL Zoo writes."""
+
+
+_PYTHON = "tag:yaml.org,2002:python"
+
+
+def _construct_mapping(loader: Any, node: Any) -> dict[str, Any]:
+    return dict(*loader.construct_sequence(node, deep=True))
+
+
+_PlainLoader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _construct_mapping)
+_PlainLoader.add_constructor(f"{_PYTHON}/tuple", _PlainLoader.construct_yaml_seq)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """:raises ValueError: if a file is not a mapping of plain values"""
+    try:
+        content = yaml.load(path.read_text(), _PlainLoader)
+    except (OSError, yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not YAML of plain values: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must be a mapping")
+    return content
 
 
 def _env_name(env_id: str) -> str:

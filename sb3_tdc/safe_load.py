@@ -109,6 +109,16 @@ def load_safely(
         return _make_model(algorithm, policy_class, env, device, fields, tensors)
 
 
+def read_data(path: str | Path) -> dict[str, Any]:
+    """
+    :return: the JSON of a saved model, as it stands there: nothing in it is checked, rebuilt or run
+    :raises UnsafeFileError: if it is not the zip of a saved model
+    """
+    with _reading(f"{path} is not the zip of a saved model"):
+        with Path(path).open("rb") as file:
+            return _parse_data(_read_archive(file, _MODEL_ENTRIES)["data"])
+
+
 def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
     """
     What ``VecNormalize.load`` does, without running anything that is in the file.
@@ -149,8 +159,6 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
             raise UnsafeFileError(f"its position, {saved['pos']}, is outside")
         vars(buffer).update(saved)
         if isinstance(buffer, HerReplayBuffer):
-            assert model.env is not None
-            buffer.set_env(model.env)
             buffer.truncate_last_trajectory()
 
 
@@ -478,10 +486,7 @@ def _read_fields(raw: bytes, custom_objects: dict[str, Any]) -> dict[str, Any]:
     :return: the fields of ``data`` that are known, each checked; those of ``custom_objects`` as they are given
     :raises UnsafeFileError: for any other, by name
     """
-    with _reading("data"):
-        data = json.loads(raw, object_pairs_hook=_unique)
-        if not isinstance(data, dict):
-            raise UnsafeFileError("it does not hold fields")
+    data = _parse_data(raw)
     classes = {**CLASSES, **{name_of(policy): policy for policy in _policies()}}
     fields = {}
     for name, value in data.items():
@@ -502,6 +507,14 @@ def _read_fields(raw: bytes, custom_objects: dict[str, Any]) -> dict[str, Any]:
     return fields
 
 
+def _parse_data(raw: bytes) -> dict[str, Any]:
+    with _reading("data"):
+        data = json.loads(raw, object_pairs_hook=_unique)
+        if not isinstance(data, dict):
+            raise UnsafeFileError("it does not hold fields")
+        return data
+
+
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len({name for name, _ in pairs}) != len(pairs):
         raise UnsafeFileError("it has a field twice")
@@ -510,7 +523,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _check_replay_memory(fields: dict[str, Any]) -> None:
     size, observations = fields.get("buffer_size", 1), fields["observation_space"]
-    parts = observations.spaces.values() if isinstance(observations, spaces.Dict) else [observations]
+    parts: Any = observations.spaces.values() if isinstance(observations, spaces.Dict) else [observations]
     n_bytes = size * sum(2 * math.prod(part.shape) * part.dtype.itemsize for part in parts)
     if n_bytes > MAX_REPLAY_BYTES:
         raise UnsafeFileError(

@@ -170,7 +170,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"  python train.py {_command_to_go_on(argv, total - steps, folder.model)}")
         return 130
     if args.verbose > 0:
-        print(f"To watch it: python enjoy.py {folder.path}")
+        packages = f" --gym-packages {shlex.join(args.gym_packages)}" if args.gym_packages else ""
+        print(f"To watch it: python enjoy.py {folder.path}{packages}")
     return 0
 
 

@@ -1,0 +1,661 @@
+"""Files of others: what SB3 saves opens, bit for bit; what is poisoned, damaged or huge is refused, and never runs."""
+
+import base64
+import collections
+import contextlib
+import io
+import json
+import os
+import pickle
+import re
+import shutil
+import struct
+import zipfile
+from pathlib import Path
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+
+from sb3_tdc import TDC, UnsafeFileError, enjoy, load_safely
+from sb3_tdc.inert_pickle import read_pickle
+from sb3_tdc.safe_load import load_normalization, load_replay_buffer
+from tests.test_command_line import SMALL, run_enjoy, run_train
+
+TINY = {"learning_starts": 10, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
+
+
+def noise(kind=NormalActionNoise):
+    return kind(np.zeros(1), np.full(1, 0.3))
+
+
+def pendulum(algorithm, policy_kwargs=None, n_envs=1, n=60, **kwargs):
+    env = make_vec_env("Pendulum-v1", n_envs, seed=0)
+    policy_kwargs = {"net_arch": [8, 8], **(policy_kwargs or {})}
+    return algorithm("MlpPolicy", env, policy_kwargs=policy_kwargs, **{**TINY, **kwargs}).learn(n)
+
+
+def goal_env():
+    return BitFlippingEnv(n_bits=3, continuous=True)
+
+
+def frames():
+    return VecNormalize(VecFrameStack(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), 3))
+
+
+def linear():
+    return LinearSchedule(1e-3, 0.0, 1.0)
+
+
+HER = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"n_sampled_goal": 2}}
+MODELS = {
+    "tdc": lambda: pendulum(TDC, {"n_quantiles": 5, "activation_fn": th.nn.ELU}, lam=linear()),
+    "tdc-stochastic": lambda: pendulum(TDC, n_envs=2, stochastic_actor=True, n_steps=3, qf_learning_rate=linear()),
+    "tdc-fixed-temperature": lambda: pendulum(TDC, stochastic_actor=True, ent_coef=0.2, action_noise=None),
+    "tdc-her": lambda: TDC("MultiInputPolicy", goal_env(), **HER, **TINY).learn(40),
+    "tdc-dict": lambda: TDC("MultiInputPolicy", SimpleMultiObsEnv(discrete_actions=False), **TINY).learn(12),
+    "tdc-image": lambda: TDC("CnnPolicy", FakeImageEnv(40, 40, n_channels=1, discrete=False), **TINY).learn(12),
+    "tdc-frames": lambda: TDC("MlpPolicy", frames(), train_freq=(1, "episode"), **TINY).learn(210),
+    "td3": lambda: pendulum(TD3, action_noise=noise(OrnsteinUhlenbeckActionNoise), learning_rate=linear()),
+    "td3-vectorized-noise": lambda: pendulum(TD3, n_envs=2, action_noise=noise(), optimize_memory_usage=False),
+    "ddpg": lambda: pendulum(DDPG, {"optimizer_class": th.optim.AdamW}, action_noise=noise()),
+    "sac": lambda: pendulum(SAC, learning_rate=linear(), ent_coef="auto_0.1"),
+    "sac-sde": lambda: pendulum(SAC, {"use_expln": True}, use_sde=True, use_sde_at_warmup=True),
+    "sac-her": lambda: SAC("MultiInputPolicy", goal_env(), **HER, **TINY).learn(40),
+}
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """The zip of a small TDC model with one field of every kind: schedules, noise, classes, spaces."""
+    path = tmp_path_factory.mktemp("saved") / "model.zip"
+    MODELS["tdc-stochastic"]().save(path)
+    return path
+
+
+@pytest.fixture
+def marker(tmp_path, monkeypatch):
+    """A file that exists if anything poisoned ran."""
+    path = tmp_path / "executed"
+    monkeypatch.setenv("MARKER", str(path))
+    return path
+
+
+def touch_marker():
+    Path(os.environ["MARKER"]).touch()
+
+
+class Poison:
+    """Runs when it is unpickled: by a builtin that needs no import of this module, as an attacker's would."""
+
+    def __reduce__(self):
+        return (exec, ("import os, pathlib; pathlib.Path(os.environ['MARKER']).touch()",))
+
+
+POISONS = {
+    "reduce": Poison(),
+    "in a dict": {"net_arch": [8, 8], "activation_fn": Poison()},
+    "in a list in a dict": {"net_arch": [[Poison()]]},
+    "function": lambda *_: touch_marker(),
+    "class": type("Mine", (), {"__init__": lambda self, *_: touch_marker()}),
+    "foreign class": pickle.Pickler,
+}
+
+
+def serialized(value):
+    return {":type:": "?", ":serialized:": base64.b64encode(cloudpickle.dumps(value)).decode()}
+
+
+def rewrite(source, target, **entries):
+    """A copy of a zip with some of its entries replaced or added (``None``: left out)."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        contents = {**{name: old.read(name) for name in old.namelist()}, **entries}
+        for name, content in contents.items():
+            if content is not None:
+                new.writestr(name, content)
+    return target
+
+
+def fields_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return json.loads(archive.read("data"))
+
+
+def with_fields(source, target, **fields):
+    return rewrite(source, target, data=json.dumps({**fields_of(source), **fields}))
+
+
+def error_of(path, **kwargs):
+    """The sentence with which a file is refused, or None if it opens."""
+    message = None
+    try:
+        load_safely(path, device="cpu", **kwargs)
+    except UnsafeFileError as error:
+        message = str(error)
+    assert message is None or (len(message) < 800 and "\n" not in message)
+    return message
+
+
+def refuse(path, **kwargs):
+    message = error_of(path, **kwargs)
+    assert message is not None, "it was opened"
+    return message
+
+
+# -------------------------------------------------------------------- what opens
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_it_opens_what_sb3_saves_and_is_the_same_model(tmp_path, name, monkeypatch):
+    model = MODELS[name]()
+    path = tmp_path / "model"
+    model.save(path)
+    env = model.get_env()
+    algorithm = DDPG if name == "ddpg" else None
+    given_env = env if "her" in name else None  # as SB3, whose HerReplayBuffer needs one
+
+    def forbidden(*args, **kwargs):
+        raise AssertionError("an unpickler was used")
+
+    with monkeypatch.context() as patch:  # torch's restricted one is its own
+        for module, attribute in ((pickle, "load"), (pickle, "loads"), (cloudpickle, "loads")):
+            patch.setattr(module, attribute, forbidden)
+        opened = load_safely(path, given_env, device="cpu", algorithm=algorithm)
+    reference = type(model).load(path, env=given_env, device="cpu")
+
+    assert type(opened) is type(model)
+    observation = env.reset()
+    for deterministic in (True, False) if name != "sac-sde" else (True,):  # SB3 draws gSDE's noise anew
+        actions = []
+        for of in (opened, reference):
+            th.manual_seed(0)
+            actions.append(of.predict(observation, deterministic=deterministic)[0])
+        np.testing.assert_array_equal(*actions)
+    assert str(opened.get_parameters()) == str(reference.get_parameters())  # optimizers and all
+    left = {"start_time", "ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs", "action_noise"}
+    left |= {"_last_episode_starts"}
+    for key, value in vars(reference).items():
+        if key not in left and " object at 0x" not in str(value):
+            assert str(vars(opened)[key]) == str(value), key
+    assert str(opened.action_noise) in str(reference.action_noise)  # VectorizedActionNoise holds it
+
+    opened.set_env(env)  # and it goes on learning
+    steps = opened.num_timesteps
+    opened.learning_starts = steps + 10  # HER samples after the end of an episode
+    opened.learn(30, reset_num_timesteps=False)
+    assert opened.num_timesteps > steps
+
+
+def test_a_schedule_of_ones_own_is_refused_by_name_and_can_be_replaced(tmp_path, marker):
+    model = pendulum(SAC, learning_rate=lambda _: 1e-3)
+    model.learning_rate = POISONS["function"]
+    path = tmp_path / "model.zip"
+    model.save(path)
+    assert "the field learning_rate (custom_objects can replace it): a call of cloudpickle" in refuse(path)
+    opened = load_safely(path, custom_objects={"learning_rate": 5e-4}, device="cpu")
+    assert opened.lr_schedule(1.0) == 5e-4
+    assert load_safely(path, learning_rate=2e-4, device="cpu").lr_schedule(1.0) == 2e-4
+    assert not marker.exists()
+
+
+def test_tqc_opens_too(tmp_path):
+    contrib = pytest.importorskip("sb3_contrib")
+    model = pendulum(contrib.TQC)
+    model.save(tmp_path / "tqc")
+    opened = load_safely(tmp_path / "tqc", device="cpu")
+    observation = np.ones(3, np.float32)
+    assert type(opened) is contrib.TQC
+    np.testing.assert_array_equal(*(m.predict(observation, deterministic=True)[0] for m in (opened, model)))
+
+
+def test_the_environment_must_be_that_of_the_model(saved):
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        load_safely(saved, gym.make("MountainCarContinuous-v0"), device="cpu")
+    space = gym.spaces.Box(-1, 1, (5,), np.float32)
+    message = refuse(saved, custom_objects={"observation_space": space})
+    assert "actor.latent_pi.0.weight is (8, 3), but the environment and policy_kwargs make it (8, 5)" in message
+    assert "was saved by TDC, not by SAC" in refuse(saved, algorithm=SAC)
+
+
+def test_the_folder_of_logs_is_not_the_files(saved, tmp_path):
+    path = with_fields(saved, tmp_path / "x.zip", tensorboard_log=str(tmp_path / "elsewhere"))
+    assert load_safely(path, device="cpu").tensorboard_log is None
+
+
+# -------------------------------------------------------------------- what does not run
+
+
+@pytest.mark.parametrize("poison", POISONS)
+def test_no_poisoned_field_runs(saved, tmp_path, marker, poison):
+    names = [*fields_of(saved), "unknown", "predict", "policy", "__class__"]
+    assert len(names) > 50
+    for name in names:
+        path = with_fields(saved, tmp_path / "x.zip", **{name: serialized(POISONS[poison])})
+        message = error_of(path)
+        if name.startswith(("_last", "lr_schedule", "start_time", "ep_", "tensorboard", "_target_entropy")):
+            assert message is None, name  # not looked at
+        else:
+            assert message is not None, name
+            assert name in message
+        assert not marker.exists(), name
+
+
+def test_the_poison_is_one(saved, tmp_path, marker):
+    """The control: SB3 runs it."""
+    TDC.load(with_fields(saved, tmp_path / "x.zip", start_time=serialized(Poison())))
+    assert marker.exists()
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("os.system", {"__module__": "os", "__name__": "system"}, {":serialized:": 3}, {":serialized:": "%%"}, [1]),
+        *(float("inf"), -(10**9), {"a": {"b": {"c": {"d": {"e": {}}}}}}, float("nan"), None, "x" * 1000),
+    ],
+    ids=str,
+)
+def test_odd_values_give_one_sentence(saved, tmp_path, value):
+    opened = 0
+    for name in fields_of(saved):
+        path = with_fields(saved, tmp_path / "x.zip", **{name: value})
+        opened += error_of(path) is None
+    assert opened < 25  # what is not looked at, and what may be so
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"policy_kwargs": {"net_arch": [8, 8], "n_quantiles": 10**9}}, "critic.layers.4.weight"),
+        ({"policy_kwargs": {"net_arch": [10**9, 10**9]}}, "actor.latent_pi.0.weight"),
+        ({"policy_kwargs": {"net_arch": [8] * 100_000}}, "policy_kwargs"),
+        ({"policy_kwargs": {"net_arch": [8, 8], "n_critics": 10**8}}, "n_critics must be at most"),
+        ({"policy_kwargs": {"net_arch": [8, 8], "n_quantiles": 10**30}}, "policy_kwargs"),
+        ({"policy_kwargs": {"net_arch": [8, 8], "features_extractor_class": "os.system"}}, "policy_kwargs"),
+        ({"policy_kwargs": {"net_arch": [8, 8], "surprise": 1}}, "unknown key 'surprise'"),
+        ({"buffer_size": 10**12}, "give a smaller buffer_size"),
+        ({"n_envs": 10**9}, "n_envs must be at most"),
+        ({"policy_class": "sb3_tdc.tdc.policies.TDCPolicy"}, "policy_class"),
+        ({"replay_buffer_class": serialized(TDC)}, "replay_buffer_class"),
+        ({"unknown": 1}, "'unknown' is unknown"),
+    ],
+)
+def test_absurd_sizes_are_refused_before_memory_is_taken(saved, tmp_path, fields, message):
+    assert message in refuse(with_fields(saved, tmp_path / "x.zip", **fields))
+
+
+def test_a_smaller_buffer_than_the_files(saved, tmp_path):
+    path = with_fields(saved, tmp_path / "x.zip", buffer_size=10**12)
+    assert load_safely(path, buffer_size=5, device="cpu").buffer_size == 5
+
+
+def test_json_too_deep_or_with_a_field_twice(saved, tmp_path):
+    assert "recursion" in refuse(rewrite(saved, tmp_path / "x.zip", data="[" * 10**6))
+    assert "twice" in refuse(rewrite(saved, tmp_path / "x.zip", data='{"tau": 0.1, "tau": 0.2}'))
+    refuse(rewrite(saved, tmp_path / "x.zip", data='{"tau": %s}' % ("9" * 10**5)))
+    refuse(rewrite(saved, tmp_path / "x.zip", data="3"))
+
+
+# -------------------------------------------------------------------- weights
+
+
+def pth(content):
+    file = io.BytesIO()
+    th.save(content, file)
+    return file.getvalue()
+
+
+TENSOR_FILES = (
+    "policy.pth", "actor.optimizer.pth", "critic.optimizer.pth", "ent_coef_optimizer.pth", "pytorch_variables.pth",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TENSOR_FILES)
+def test_no_poisoned_tensors_run(saved, tmp_path, marker, name):
+    with zipfile.ZipFile(saved) as archive:
+        good = archive.read(name)
+    state = th.load(io.BytesIO(good), weights_only=True)
+    poisoned = [
+        pth(Poison()),
+        pth({**state, "x": Poison()}),
+        pth({**state, "x": th.nn.Linear(2, 2)}),
+        pickle.dumps(Poison()),
+        rewrite_bytes(good, "data.pkl", pickle.dumps(Poison(), 2)),
+        rewrite_bytes(good, "data.pkl", b"cos\nsystem\n(S'true'\ntR."),
+        rewrite_bytes(good, "code/evil.py", b"1"),
+        good[:-30],
+        good[:200],
+        b"",
+    ]
+    for content in poisoned:
+        assert name in refuse(rewrite(saved, tmp_path / "x.zip", **{name: content}))
+        assert not marker.exists()
+
+
+def rewrite_bytes(raw, suffix, content):
+    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+        prefix = archive.namelist()[0].partition("/")[0]
+    target = io.BytesIO()
+    rewrite(io.BytesIO(raw), target, **{f"{prefix}/{suffix}": content})
+    return target.getvalue()
+
+
+def test_tensors_that_say_more_than_their_bytes_are_refused(saved, tmp_path):
+    """A storage's size is only a number in the pickle; nothing is read or allocated by it."""
+    with zipfile.ZipFile(saved) as archive:
+        raw = archive.read("policy.pth")
+    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+        tree = archive.read("archive/data.pkl")
+    size = b"K\x18t"  # 24 numbers of the first layer, (8, 3), as its storage says
+    for lie in (b"K\x19t", b"M\xff\xfft", b"J\xff\xff\xff\x7ft", b"J\xff\xff\xff\xfft"):
+        assert size in tree
+        poisoned = rewrite_bytes(raw, "data.pkl", tree.replace(size, lie, 1))
+        assert "a tensor with other bytes" in refuse(rewrite(saved, tmp_path / "x.zip", **{"policy.pth": poisoned}))
+    huge = th.zeros(1).expand(10**12)  # one number, a stride of 0
+    assert "larger than its storage" in refuse(rewrite(saved, tmp_path / "x.zip", **{"policy.pth": pth({"w": huge})}))
+
+
+def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
+    def state(name):
+        with zipfile.ZipFile(saved) as archive:
+            return th.load(io.BytesIO(archive.read(name)), weights_only=True)
+
+    def refuse_with(name, content, match):
+        assert re.search(match, refuse(rewrite(saved, tmp_path / "x.zip", **{name: pth(content)})))
+
+    weights = state("policy.pth")
+    first = next(iter(weights))
+    refuse_with("policy.pth", {**weights, first: weights[first] * float("nan")}, f"{first} has values.*not finite")
+    refuse_with("policy.pth", {**weights, first: weights[first].T.contiguous()}, rf"{first} is \(3, 8\)")
+    refuse_with("policy.pth", {k: v for k, v in weights.items() if k != first}, f"{first} is missing")
+    refuse_with("policy.pth", {**weights, "more": th.zeros(1)}, "more is")
+    for change, match in (
+        (lambda s: s["state"][0].update(exp_avg=th.zeros(1)), "'exp_avg' of parameter 0"),
+        (lambda s: s["state"][0].update(surprise=th.zeros(1)), "'surprise'"),
+        (lambda s: s["state"].update({99: s["state"][0]}), "."),
+        (lambda s: s["param_groups"][0].update(lr=float("inf")), "'lr'"),
+        (lambda s: s["param_groups"][0].update(surprise=1), "'surprise'"),
+        (lambda s: s["param_groups"][0].update(params=[0] * 5), "other parameters"),
+        (lambda s: s["param_groups"].clear(), "not the state of this optimizer"),
+    ):
+        changed = state("actor.optimizer.pth")
+        change(changed)
+        refuse_with("actor.optimizer.pth", changed, match)
+    refuse_with("pytorch_variables.pth", {"log_ent_coef": th.zeros(7)}, "another shape")
+    refuse_with("pytorch_variables.pth", {"policy": th.zeros(1)}, "policy: it is unknown")
+
+
+# -------------------------------------------------------------------- zips
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "/etc/evil", "..\\evil", "evil.pth", "policy.pth/x", "env.pth", "data\n", "DATA", "actor.pth"]
+)
+def test_other_entries_are_refused_and_nothing_is_written(saved, tmp_path, name):
+    assert "unknown or repeated" in refuse(rewrite(saved, tmp_path / "x.zip", **{name: b"1"}))
+    assert {path.name for path in tmp_path.iterdir()} == {"x.zip"}
+
+
+def test_a_repeated_entry_is_refused(saved, tmp_path):
+    shutil.copy(saved, tmp_path / "x.zip")
+    with zipfile.ZipFile(tmp_path / "x.zip", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("data", "{}")
+    assert "unknown or repeated" in refuse(tmp_path / "x.zip")
+
+
+def test_zip_bombs_are_refused_unread(saved, tmp_path, monkeypatch):
+    path = tmp_path / "x.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data", b"0" * 50_000_000)
+
+    def forbidden(*_):
+        raise AssertionError("it was read")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile.ZipFile, "read", forbidden)
+        assert "compressed more than 100-fold" in refuse(path)
+    many = tmp_path / "many.zip"
+    with zipfile.ZipFile(many, "w") as archive:
+        for i in range(25_000):
+            archive.writestr(f"{i}", b"")
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile, "ZipFile", forbidden)
+        assert "too many entries" in refuse(many)
+    lie = bytearray(saved.read_bytes())  # an entry that says it is of 4 GB
+    entry = lie.rindex(b"PK\1\2")
+    struct.pack_into("<LL", lie, entry + 20, 2**32 - 2, 2**32 - 2)
+    path.write_bytes(lie)
+    assert "holds more than" in refuse(path)
+
+
+def test_a_compressed_copy_opens(saved, tmp_path):
+    with zipfile.ZipFile(saved) as old, zipfile.ZipFile(tmp_path / "x.zip", "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+    load_safely(tmp_path / "x.zip", device="cpu")
+
+
+def test_files_that_are_no_models(saved, tmp_path):
+    path = tmp_path / "x.zip"
+    content = saved.read_bytes()
+    for broken in (b"", b"PK", content[:-1], content[1000:], content[:1000], b"\0" * 10_000, content + b"x"):
+        path.write_bytes(broken)
+        refuse(path)
+    assert "has no policy.pth" in refuse(rewrite(saved, path, **{"policy.pth": None}))
+    assert "has no data" in refuse(rewrite(saved, path, data=None))
+    assert "No such file" in refuse(tmp_path / "nothing.zip")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_damaged_file_opens_or_is_refused(saved, tmp_path, data):
+    content = bytearray(saved.read_bytes())
+    places = st.integers(0, len(content) - 1)
+    for place in data.draw(st.lists(places, max_size=4), label="changed bytes"):
+        content[place] = data.draw(st.integers(0, 255))
+    if data.draw(st.booleans(), label="cut"):
+        del content[data.draw(places) :]
+    path = tmp_path / "x.zip"
+    path.write_bytes(content)
+    error_of(path)
+
+
+PICKLES = [
+    cloudpickle.dumps(value)
+    for value in (gym.spaces.Box(-1, 1, (2,)), noise(), {"a": [1, (2.0, None)]}, TDC, lambda x: x, collections.deque())
+]
+
+
+@settings(max_examples=300, deadline=None)
+@given(raw=st.one_of(st.binary(max_size=200), st.sampled_from(PICKLES)), data=st.data())
+def test_any_bytes_are_read_as_a_pickle_or_refused(raw, data):
+    content = bytearray(raw)
+    for place in data.draw(st.lists(st.integers(0, max(len(raw) - 1, 0)), max_size=3)) if raw else []:
+        content[place] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(UnsafeFileError):
+        read_pickle(bytes(content))
+
+
+def test_pickles_that_grow_are_refused(saved, tmp_path):
+    doubled: list = []
+    for _ in range(200):  # 2**200 lists, in 200
+        doubled = [doubled, doubled]
+    itself: list = []
+    itself.append(itself)
+    for value in (doubled, itself):
+        path = with_fields(saved, tmp_path / "x.zip", policy_kwargs=serialized({"net_arch": value}))
+        assert "contains itself, or is nested too deeply" in refuse(path)
+    raw = pickle.dumps(1 << 10_000)
+    path = with_fields(saved, tmp_path / "x.zip", tau={":serialized:": base64.b64encode(raw).decode()})
+    assert "an integer of 10,001 bits" in refuse(path)
+
+
+# -------------------------------------------------------------------- normalisation and replay buffers
+
+
+def test_normalisation_is_that_of_sb3(tmp_path, marker):
+    path = tmp_path / "vecnormalize.pkl"
+    env = VecNormalize(make_vec_env("Pendulum-v1", 2, seed=0), gamma=0.9, clip_obs=3.0, norm_reward=False)
+    env.reset()
+    for _ in range(20):
+        env.step(np.ones((2, 1)))
+    env.save(str(path))
+    opened, reference = load_normalization(path, env.venv), VecNormalize.load(str(path), env.venv)
+    observations, rewards = np.random.RandomState(0).randn(5, 3), np.arange(5.0)
+    np.testing.assert_array_equal(opened.normalize_obs(observations), reference.normalize_obs(observations))
+    np.testing.assert_array_equal(opened.normalize_reward(rewards), reference.normalize_reward(rewards))
+    assert (opened.gamma, opened.clip_obs, opened.norm_reward, opened.training) == (0.9, 3.0, False, True)
+
+    with pytest.raises(UnsafeFileError, match="obs_rms are not those of"):
+        load_normalization(path, make_vec_env("MountainCarContinuous-v0"))
+    for name in ("obs_rms", "gamma", "norm_obs_keys", "training"):
+        poisoned = VecNormalize.load(str(path), env.venv)
+        setattr(poisoned, name, Poison())
+        poisoned.save(str(path.with_name("poisoned.pkl")))
+        with pytest.raises(UnsafeFileError, match=r"builtins\.exec|must be"):
+            load_normalization(path.with_name("poisoned.pkl"), env.venv)
+    for broken in (pickle.dumps(Poison()), path.read_bytes()[:-9], b"", pickle.dumps({})):
+        path.write_bytes(broken)
+        with pytest.raises(UnsafeFileError):
+            load_normalization(path, env.venv)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("name", ["tdc", "tdc-stochastic", "tdc-dict", "tdc-her"])
+def test_a_replay_buffer_is_that_of_sb3(tmp_path, marker, name):
+    model = MODELS[name]()
+    path = tmp_path / "replay_buffer.pkl"
+    model.save_replay_buffer(path)
+    opened, reference = (MODELS[name]() for _ in range(2))
+    opened.learn(30)
+    load_replay_buffer(path, opened)
+    reference.load_replay_buffer(path)
+    batches = []
+    for of in (opened, reference):
+        np.random.seed(0)
+        batches.append(str(of.replay_buffer.sample(16)))
+    assert batches[0] == batches[1]
+    opened.learn(30)
+
+    small = MODELS[name]()
+    small.buffer_size, small.replay_buffer = 100, None
+    small._setup_model()
+    with pytest.raises(UnsafeFileError, match="are not those of this run"):
+        load_replay_buffer(path, small)
+    for attribute in ("observations", "pos", "rewards"):
+        poisoned = MODELS[name]()
+        setattr(poisoned.replay_buffer, attribute, Poison())
+        poisoned.save_replay_buffer(path)
+        with pytest.raises(UnsafeFileError):
+            load_replay_buffer(path, opened)
+    path.write_bytes(pickle.dumps(Poison()))
+    with pytest.raises(UnsafeFileError, match="does not hold a"):
+        load_replay_buffer(path, opened)
+    assert not marker.exists()
+
+
+# -------------------------------------------------------------------- enjoy.py and train.py
+
+
+@pytest.fixture
+def run(tmp_path):
+    small = [*SMALL, "normalize:true"]
+    assert run_train(tmp_path, "--save-replay-buffer", small=small) == 0
+    return tmp_path / "tdc" / "Hopper-v4_1"
+
+
+def test_enjoy_runs_nothing_unless_it_is_trusted(run, marker, capsys):
+    assert run_enjoy(run) == 0
+    safely = capsys.readouterr()
+    assert run_enjoy(run, "--trust") == 0
+    trusting = capsys.readouterr()
+    assert trusting.out == safely.out  # the same returns
+    assert "--trust: whatever code these files hold runs with your rights" in trusting.err
+    assert safely.err == ""
+
+    model, normalization = run / "Hopper-v4.zip", run / "Hopper-v4" / "vecnormalize.pkl"
+    poisoned = with_fields(model, run / "poisoned", gamma=serialized(Poison())).read_bytes()
+    for path, content, message in (
+        (model, poisoned, "the field gamma (custom_objects can replace it): a call of builtins.exec"),
+        (normalization, pickle.dumps(Poison()), "it does not hold a VecNormalize"),
+    ):
+        good = path.read_bytes()
+        path.write_bytes(content)
+        with pytest.raises(SystemExit):
+            run_enjoy(run)
+        assert f"{path} was not opened: {message}" in capsys.readouterr().err
+        assert not marker.exists()
+        with contextlib.suppress(Exception):  # what the poison returns is no model
+            run_enjoy(run, "--trust")
+        assert marker.exists()
+        marker.unlink()
+        path.write_bytes(good)
+
+
+def test_going_on_runs_nothing_unless_it_is_trusted(run, tmp_path, marker, capsys):
+    buffer = run / "replay_buffer.pkl"
+    buffer.write_bytes(pickle.dumps(Poison()))
+    small = [*SMALL, "normalize:true"]
+    with pytest.raises(SystemExit):
+        run_train(tmp_path, "-i", run / "Hopper-v4.zip", small=small)
+    assert "replay_buffer.pkl was not opened: it does not hold a ReplayBuffer" in capsys.readouterr().err
+    assert not marker.exists()
+
+
+def test_a_run_of_others_imports_nothing_that_is_not_named(run, tmp_path, monkeypatch, marker, capsys):
+    (tmp_path / "evil.py").write_text("import os, pathlib; pathlib.Path(os.environ['MARKER']).touch()")
+    monkeypatch.syspath_prepend(tmp_path)
+    files = {name: run / "Hopper-v4" / name for name in ("args.yml", "config.yml")}
+    good = {name: yaml.safe_load(path.read_text()) for name, path in files.items()}
+    for name, change, message in (
+        ("args.yml", {"gym_packages": ["evil"]}, "add --gym-packages evil"),
+        ("args.yml", {"env": "evil:Hopper-v4"}, "add --gym-packages evil"),
+        ("config.yml", {"env_wrapper": "evil.Wrapper"}, "asks for env_wrapper evil.Wrapper"),
+        ("config.yml", {"env_wrapper": [{"evil.Wrapper": {}}]}, "asks for env_wrapper evil.Wrapper"),
+        ("config.yml", {"vec_env_wrapper": ["subprocess.Popen"]}, "asks for vec_env_wrapper subprocess.Popen"),
+    ):
+        files[name].write_text(yaml.safe_dump({**good[name], **change}))
+        with pytest.raises(SystemExit):
+            run_enjoy(run)
+        assert message in capsys.readouterr().err
+        files[name].write_text(yaml.safe_dump(good[name]))
+    files["config.yml"].write_text("!!python/object/apply:os.system [true]")
+    with pytest.raises(SystemExit):
+        run_enjoy(run)
+    assert "is not YAML of plain values" in capsys.readouterr().err
+    files["config.yml"].write_text(yaml.safe_dump({**good["config.yml"], "policy": "evil.P", "callback": "evil.C"}))
+    assert run_enjoy(run) == 0  # neither is needed to watch
+    assert not marker.exists()
+    files["args.yml"].write_text(yaml.safe_dump({**good["args.yml"], "gym_packages": ["evil"]}))
+    assert run_enjoy(run, "--gym-packages", "evil") == 0
+    assert marker.exists()
+
+
+def test_a_folder_of_rl_zoo_opens(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("rl_zoo3")
+    conf = tmp_path / "td3.yml"
+    conf.write_text(
+        "Pendulum-v1:\n  n_timesteps: 250\n  policy: MlpPolicy\n  normalize: true\n  learning_rate: lin_1e-3\n"
+        "  noise_type: normal\n  noise_std: 0.1\n  learning_starts: 50\n  batch_size: 16\n  buffer_size: 1000\n"
+        '  policy_kwargs: "dict(net_arch=[16, 16])"\n'
+    )
+    from rl_zoo3.train import train as zoo_train
+
+    argv = ["--algo", "td3", "--env", "Pendulum-v1", "-f", str(tmp_path), "-conf", str(conf), "--eval-freq", "100"]
+    monkeypatch.setattr("sys.argv", ["train", *argv, "--eval-episodes", "1", "--device", "cpu", "--seed", "1"])
+    zoo_train()
+    capsys.readouterr()
+    for arguments in ([], ["--load-best"]):
+        assert run_enjoy(tmp_path / "td3" / "Pendulum-v1_1", *arguments) == 0
+        assert "mean ± std of 2 episodes" in capsys.readouterr().out
+    assert enjoy.make_parser().parse_args(["x"]).trust is False
