@@ -136,12 +136,16 @@ class _PlainLoader(yaml.SafeLoader):
 _PYTHON = "tag:yaml.org,2002:python"
 
 
+def _construct_sequence(loader: Any, node: Any) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)
+
+
 def _construct_mapping(loader: Any, node: Any) -> dict[str, Any]:
-    return dict(*loader.construct_sequence(node, deep=True))
+    return dict(*_construct_sequence(loader, node))
 
 
 _PlainLoader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _construct_mapping)
-_PlainLoader.add_constructor(f"{_PYTHON}/tuple", _PlainLoader.construct_yaml_seq)
+_PlainLoader.add_constructor(f"{_PYTHON}/tuple", _construct_sequence)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -168,7 +168,7 @@ def _reading(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
         raise UnsafeFileError(f"{what}: {reason}") from error
 
 
