@@ -469,6 +469,31 @@ def test_a_damaged_file_opens_or_is_refused(saved, tmp_path, data):
     error_of(path)
 
 
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damage_under_right_checksums(saved, tmp_path, marker, data):
+    """What a forger can do, and a bad disk cannot: the zip is whole, the pickle of a field or of tensors is not."""
+    fields = fields_of(saved)
+    pickled = sorted(name for name, value in fields.items() if isinstance(value, dict) and ":serialized:" in value)
+    where = data.draw(st.sampled_from([*pickled, *TENSOR_FILES]))
+    if where in TENSOR_FILES:
+        with zipfile.ZipFile(saved) as archive:
+            good = archive.read(where)
+        with zipfile.ZipFile(io.BytesIO(good)) as archive:
+            content = bytearray(archive.read("archive/data.pkl"))
+    else:
+        content = bytearray(base64.b64decode(fields[where][":serialized:"]))
+    for place in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=3)):
+        content[place] = data.draw(st.integers(0, 255))
+    if where in TENSOR_FILES:
+        path = rewrite(saved, tmp_path / "x.zip", **{where: rewrite_bytes(good, "data.pkl", bytes(content))})
+    else:
+        value = {":serialized:": base64.b64encode(content).decode()}
+        path = with_fields(saved, tmp_path / "x.zip", **{where: value})
+    error_of(path)
+    assert not marker.exists()
+
+
 PICKLES = [
     cloudpickle.dumps(value)
     for value in (gym.spaces.Box(-1, 1, (2,)), noise(), {"a": [1, (2.0, None)]}, TDC, lambda x: x, collections.deque())
