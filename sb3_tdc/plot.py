@@ -52,13 +52,18 @@ def draw_curves(axes: Any, curves: Sequence[Curve]) -> None:
         steps = np.repeat(curve.timesteps, curve.returns.shape[1])
         axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
     episodes = ", ".join(sorted({str(curve.returns.shape[1]) for curve in curves}))
-    axes.set_title(curves[0].env_id, loc="left", fontweight="bold")
-    axes.set_xlabel("environment steps")
-    axes.set_ylabel(f"return of {episodes} mean-action episodes")
+    style_axes(axes, curves[0].env_id, "environment steps", f"return of {episodes} mean-action episodes")
     axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.legend(frameon=False)
+
+
+def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
+    """What every plot of this project looks like."""
+    axes.set_title(title, loc="left", fontweight="bold")
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
-    axes.legend(frameon=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
