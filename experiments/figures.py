@@ -41,8 +41,11 @@ def draw_curves(axes: Any, curves: Sequence[Curve], title: str, ylabel: str, log
     """
     Mean over seeds with its 95 % t interval, every seed as a thin line; an unfinished one is dotted.
 
-    One seed has no interval. On a logarithmic axis, means and intervals are those of the logarithms.
+    One seed has no interval; that of two can be huge, and runs off the axis, which is made for the seeds. On a
+    logarithmic axis, means and intervals are those of the logarithms.
     """
+    if log:
+        axes.set_yscale("log")
     for curve in curves:
         for values, style in ((curve.values, "-"), (curve.unfinished, ":")):
             for run in values:
@@ -52,10 +55,10 @@ def draw_curves(axes: Any, curves: Sequence[Curve], title: str, ylabel: str, log
         mean, low, high = (np.exp(v) if log else v for v in mean_interval(values))
         axes.plot(*_finite(curve.steps, mean), color=curve.color, lw=1.8, label=label)
         axes.fill_between(curve.steps, low, high, color=curve.color, alpha=0.15, lw=0)
+    seeds = np.concatenate([v.ravel() for curve in curves for v in (curve.values, curve.unfinished)])
+    axes.set_ylim(*_limits(seeds[np.isfinite(seeds)], log))
     style_axes(axes, title, "environment steps", ylabel)
     axes.xaxis.set_major_formatter(_short_number)
-    if log:
-        axes.set_yscale("log")
     axes.legend(frameon=False, fontsize="small")
 
 
@@ -104,8 +107,12 @@ def draw_sweep(
         axes.errorbar(x, y, [y - lows[several], highs[several] - y], fmt="none", color=color, capsize=4, lw=1.2)
     for value, r in zip(values, returns, strict=True):
         axes.scatter(np.full(len(r), value), r, color=color, edgecolor="white", lw=0.6, s=26, zorder=3)
-    style_axes(axes, title, xlabel, "final return")
-    axes.set_xticks(values, [f"{v:g}\n{count_seeds(len(r))}" for v, r in zip(values, returns, strict=True)])
+    everything = np.concatenate(returns)
+    axes.set_ylim(*_limits(everything, log=False))
+    few, many = min(map(len, returns)), max(map(len, returns))
+    seeds = count_seeds(few) if few == many else f"{few} to {count_seeds(many)}"
+    style_axes(axes, title, f"{xlabel} ({seeds} each)", "final return")
+    axes.set_xticks(values, [f"{value:g}" for value in values])
 
 
 def draw_intervals(
@@ -122,6 +129,17 @@ def draw_intervals(
     style_axes(axes, "", xlabel, "")
     axes.set_yticks(range(len(labels)), labels)
     axes.set_ylim(len(labels) - 0.5, -0.5)
+
+
+def _limits(values: np.ndarray, log: bool) -> tuple[float | None, float | None]:
+    """The range of the values and a third of it on either side."""
+    if not len(values):
+        return None, None
+    low, high = np.log((values.min(), values.max())) if log else (values.min(), values.max())
+    margin = (high - low) / 3 or 1.0
+    limits = np.array([low - margin, high + margin])
+    low, high = np.exp(limits) if log else limits
+    return float(low), float(high)
 
 
 def _finite(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

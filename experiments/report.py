@@ -116,7 +116,7 @@ class Report:
             "Evaluations of the mean action, in bins of the paper's 20,000 steps, scaled with the length of the runs "
             "but never below the distance of evaluations. Thick: mean over seeds; band: 95 % interval of that mean "
             "(Student's t over seeds); thin: single seeds. One seed has no band. Unfinished runs are dotted and not "
-            "averaged. Evaluations of an ablation are in its own section as well.",
+            "averaged. The band of two seeds is huge, and runs off the axis, which is made for the seeds.",
         )
         for groups in self.by_env(self.groups).values():
             shown = headline(groups)
@@ -263,7 +263,7 @@ class Report:
     def test_returns(self) -> Section:
         section = Section(
             "Test returns (Fig. 4)",
-            f"{EPISODES} mean-action episodes of every finished run. A box pools the episodes of all seeds, the dots "
+            f"{EPISODES} mean-action episodes of every finished run, if not said otherwise. A box pools the episodes of all seeds, the dots "
             "are the means of the seeds: a tight box with dots far apart is a policy that repeats itself, and a "
             "training that does not.",
         )
@@ -295,7 +295,7 @@ class Report:
             "Published returns",
             "What others state, as they state it: other versions of the environments (v2 to v5 differ in physics and "
             "in rewards), other numbers of steps, other ways of choosing a number (a best checkpoint is higher than a "
-            "last one). They say whether ours are of the right size, and no more. The TDC-λ paper itself prints no "
+            "last one). They say whether ours are of the right size, and no more. Steps and seeds that differ by task are in the order of the tasks. The TDC-λ paper itself prints no "
             "returns, only curves.",
         )
         table = tables.make_published_table(self.returns)
@@ -417,7 +417,7 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
             "finished runs": sum(run.is_finished for run in runs),
             "unfinished": sum(not run.is_finished for run in runs),
             "environments": len({run.env_id for run in runs}),
-            "groups": len(groups),
+            "sets of seeds": len(groups),
         },
         groups=provenance.describe_groups(groups),
         runs=provenance.describe_runs(runs),

@@ -230,7 +230,9 @@ def _describe(key: str, value: Any) -> str:
     if key == "stochastic_actor":
         return "stochastic head" if value else "deterministic head"
     name = {"lam": "λ", "n_timesteps": "steps"}.get(key, key.removeprefix("policy_kwargs."))
-    return f"{name} {value:,}" if isinstance(value, int) and not isinstance(value, bool) else f"{name} {value}"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return f"{name} {value:,}"
+    return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
 
 
 def _label(run: Run, representatives: Sequence[Run]) -> str:

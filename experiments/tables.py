@@ -1,5 +1,6 @@
 """Tables: groups of runs → numbers (for CSV) → cells to read (for the report)."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -102,8 +103,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
         by_task = {row["environment"].rpartition("-")[0]: row for row in some}
         rows.append(
             {
-                "Algorithm": algorithm,
-                "Source": "this report",
+                "Algorithm": f"{algorithm}: this report",
                 **{
                     task: plus_minus(by_task[task]["final_mean"], by_task[task]["final_std"])
                     if task in by_task
@@ -123,8 +123,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
             steps = entry["steps"] if isinstance(entry["steps"], dict) else dict.fromkeys(TASKS, entry["steps"])
             rows.append(
                 {
-                    "Algorithm": algorithm,
-                    "Source": entry["source"],
+                    "Algorithm": f"{algorithm}: {entry['source']}",
                     **{task: _published_return(returns.get(task)) for task in TASKS},
                     "Environments": entry["version"],
                     "Steps": _per_task({task: f"{steps[task]:g}M" for task in TASKS}),
@@ -132,14 +131,17 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
                     "What": f"{entry['how']} ({note})" if note else entry["how"],
                 }
             )
-    names = [row["Algorithm"].partition(",")[0].removesuffix("-λ") for row in rows]
+    names = [re.split("[,:]|-λ", row["Algorithm"])[0] for row in rows]
     order = sorted(range(len(rows)), key=lambda i: names.index(names[i]))  # stable: ours comes first
     return pd.DataFrame([rows[i] for i in order])
 
 
 def number(value: float) -> str:
-    """Thousands separated; a digit behind the point below 100."""
-    return f"{value:,.1f}" if abs(value) < 100 and value != int(value) else f"{value:,.0f}"
+    """Thousands separated; a digit behind the point below 100; "–" for NaN."""
+    if np.isnan(value):
+        return "–"
+    text = f"{value:,.1f}" if abs(value) < 100 and value != int(value) else f"{value:,.0f}"
+    return text.replace("-", "−")
 
 
 def plus_minus(mean: float, std: float) -> str:
@@ -154,9 +156,10 @@ def _published_return(value: Any) -> str:
 
 
 def _per_task(values: dict[str, str]) -> str:
-    """One value if all tasks have the same."""
-    distinct = list(dict.fromkeys(values.values()))
-    return distinct[0] if len(distinct) == 1 else ", ".join(f"{task} {value}" for task, value in values.items())
+    """One value if all tasks that have one have the same, else those of all, in the order of the columns."""
+    if len(set(values.values())) == 1:
+        return next(iter(values.values()))
+    return " / ".join(values.get(task, "–") for task in TASKS)
 
 
 def _grouped(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:

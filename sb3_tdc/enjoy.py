@@ -13,13 +13,15 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments
 from sb3_tdc.experiment import ALGORITHMS, check_env_id, load_model, make_envs
+from sb3_tdc.explain import play_episodes, steps_until_negligible, write_explanation
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.rendering import VideoWriter, choose_gl_backend, follow_agent, has_display
 from sb3_tdc.run_folder import RunFolder
+from sb3_tdc.tdc import TDC
 
 
 def make_parser() -> Parser:
@@ -37,6 +39,7 @@ def make_parser() -> Parser:
     add("--n-episodes", type=int, default=5, help="episodes to play")
     add("-n", "--n-timesteps", type=int, default=-1, help="stop after so many steps (-1: no limit)")
     add("--record", type=Path, metavar="FILE.mp4", help="write a video")
+    add("--explain", action="store_true", help="draw what the critics predict against what follows, beside the model")
     add("--no-render", action="store_true", help="no picture, only returns")
     add("--stochastic", action="store_true", help="sampled instead of mean actions (SAC; TDC always takes the mean)")
     add("--seed", type=int, default=0, help="seed of the environment")
@@ -189,13 +192,57 @@ def _render_mode(args: argparse.Namespace, env_id: str) -> str | None:
     return "human" if args.record is None else "rgb_array"
 
 
+def check_explainable(args: argparse.Namespace, trained: Trained) -> None:
+    """:raises ValueError: if there is nothing to explain, or an argument has no meaning beside ``--explain``"""
+    if trained.algo != "tdc":
+        raise ValueError(f"--explain needs a model of tdc: the critics of {trained.algo} predict no distribution")
+    for name in ("record", "stochastic"):
+        if getattr(args, name):
+            raise ValueError(f"--explain plays the mean action, without a picture: leave out --{name}")
+    if args.n_timesteps != -1 or args.n_episodes < 1:
+        raise ValueError("--explain needs whole episodes: --n-episodes at least 1, and no -n")
+
+
+def extend_time_limit(trained: Trained, env_kwargs: dict[str, Any]) -> tuple[int | None, dict[str, Any]]:
+    """
+    A time limit ends an episode, but not the return that the critics predict: play on until the discount has faded.
+
+    :return: the environment's own limit, None for none, and the arguments with the later one
+    """
+    own = gym.spec(trained.env_id).max_episode_steps
+    limit = {**trained.hyperparams.env_kwargs, **env_kwargs}.get("max_episode_steps", own)
+    gamma = trained.hyperparams.model.get("gamma", 0.99)
+    if limit is None or gamma >= 1:
+        return limit, env_kwargs
+    return limit, {**env_kwargs, "max_episode_steps": limit + steps_until_negligible(gamma)}
+
+
+def explain(model: TDC, env: VecEnv, trained: Trained, n_episodes: int, limit: int | None) -> None:
+    """Play episodes, and draw what the critics predict beside the model."""
+    normalization = unwrap_vec_normalize(env)
+    if normalization is not None:  # the critics know no other rewards
+        normalization.norm_reward = (trained.hyperparams.normalize or {}).get("norm_reward", True)
+    episodes = play_episodes(model, env, n_episodes, limit)
+    unit = "normalised rewards, " if normalization is not None and normalization.norm_reward else ""
+    title = (
+        f"TDC on {trained.env_id}, {model.num_timesteps:,} steps of training ({trained.path.name}), "
+        f"{unit}λ = {model._scheduled('lam'):g}, γ = {model.gamma:g}"
+    )
+    write_explanation(model, episodes, trained.path.with_name(f"{trained.path.stem}_critics"), title)
+
+
 def _run(args: argparse.Namespace) -> int:
     if args.trust:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
     trained = find_trained(args)
     check_env_id(trained.env_id)
     set_random_seed(args.seed)
-    render_mode = _render_mode(args, trained.env_id)
+    env_kwargs = {**trained.env_kwargs, **args.env_kwargs}
+    if args.explain:
+        check_explainable(args, trained)
+        limit, env_kwargs = extend_time_limit(trained, env_kwargs)
+    else:
+        env_kwargs["render_mode"] = _render_mode(args, trained.env_id)
 
     with ExitStack() as stack:
         env = make_envs(
@@ -203,7 +250,7 @@ def _run(args: argparse.Namespace) -> int:
             trained.hyperparams,
             args.seed,
             n_envs=1,
-            env_kwargs={**trained.env_kwargs, **args.env_kwargs, "render_mode": render_mode},
+            env_kwargs=env_kwargs,
             normalization=trained.normalization,
             training=False,
             trust=args.trust,
@@ -214,6 +261,10 @@ def _run(args: argparse.Namespace) -> int:
         model = load_model(trained.path, trained.algo, env, args.trust, device=args.device, buffer_size=1)
         env.seed(args.seed)  # loading has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")
+        if args.explain:
+            assert isinstance(model, TDC)
+            explain(model, env, trained, args.n_episodes, limit)
+            return 0
         video = None
         if args.record is not None:
             fps = env.metadata.get("render_fps", 30)

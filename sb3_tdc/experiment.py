@@ -34,8 +34,9 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
+from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.hyperparams import Hyperparams
-from sb3_tdc.interruption import StopOnSignal, StoppableEvaluation, ignore_interrupts
+from sb3_tdc.interruption import StopOnSignal, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, save_model
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely, read_data
@@ -334,7 +335,7 @@ def _make_callbacks(
         )
     if eval_env is not None:
         callbacks.append(
-            StoppableEvaluation(
+            CriticEvaluation(
                 eval_env,
                 stop,
                 callback_on_new_best=_SaveNormalization(folder.normalization(folder.best_model)),
