@@ -263,9 +263,9 @@ class Report:
     def test_returns(self) -> Section:
         section = Section(
             "Test returns (Fig. 4)",
-            f"{EPISODES} mean-action episodes of every finished run, if not said otherwise. A box pools the episodes of all seeds, the dots "
-            "are the means of the seeds: a tight box with dots far apart is a policy that repeats itself, and a "
-            "training that does not.",
+            f"{EPISODES} mean-action episodes of every finished run, if not said otherwise. A box pools the episodes "
+            "of all seeds, the dots are the means of the seeds: a tight box with dots far apart is a policy that "
+            "repeats itself, and a training that does not.",
         )
         for env_id, groups in self.by_env(self.groups).items():
             tested = []
@@ -295,8 +295,8 @@ class Report:
             "Published returns",
             "What others state, as they state it: other versions of the environments (v2 to v5 differ in physics and "
             "in rewards), other numbers of steps, other ways of choosing a number (a best checkpoint is higher than a "
-            "last one). They say whether ours are of the right size, and no more. Steps and seeds that differ by task are in the order of the tasks. The TDC-λ paper itself prints no "
-            "returns, only curves.",
+            "last one). They say whether ours are of the right size, and no more. Steps and seeds that differ by task "
+            "are in the order of the columns. The TDC-λ paper itself prints no returns, only curves.",
         )
         table = tables.make_published_table(self.returns)
         self.write_table("published", table)

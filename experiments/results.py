@@ -232,6 +232,8 @@ def _describe(key: str, value: Any) -> str:
     name = {"lam": "λ", "n_timesteps": "steps"}.get(key, key.removeprefix("policy_kwargs."))
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{name} {value:,}"
+    if value is None:
+        return f"{name} left to its default"
     return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
 
 

@@ -320,8 +320,9 @@ def describe_play(model: TDC) -> str:
     """What one must know to read the figures."""
     target = "samples of the tanh-Gaussian" if model.stochastic_actor else "the mean action with smoothing noise"
     paragraphs = (
-        f"Played: the mean action, without noise. The critics are trained for another policy, {target}, without entropy, "
-        "and towards the critic with the smaller μ − λσ: even a perfect one need not be calibrated for what is played.",
+        f"Played: the mean action, without noise. The critics are trained for another policy, {target}, without "
+        "entropy, and towards the one with the smaller μ − λσ: even perfect ones need not be calibrated for what is "
+        "played.",
         "Realised: the discounted return from a step on. A time limit does not end it: play goes on behind it until "
         f"the discount is below {TOLERANCE:.0%}. Where less was seen, there is no line.",
         "The steps of one episode share most of their return. An episode is nearer to one observation than to a "

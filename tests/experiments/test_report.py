@@ -1,0 +1,217 @@
+"""Tables, figures and the page: from folders made by hand, then from real runs."""
+
+import html
+import re
+
+import numpy as np
+import pytest
+import yaml
+from matplotlib import figure
+
+from experiments import figures, report, tables, test_returns
+from experiments.results import find_runs, group_runs
+from sb3_tdc import train
+from tests.experiments.test_results import make_run
+
+
+def read_groups(folder):
+    return group_runs(find_runs(folder)[0])
+
+
+def test_table_by_hand(tmp_path):
+    # finals 2 and 6; bests 2 and 10; areas (0 + 2)/2 and (10 + 6)/2
+    make_run(tmp_path, seed=1, returns=((-1.0, 1.0), (1.0, 3.0)))
+    make_run(tmp_path, seed=2, returns=((9.0, 11.0), (5.0, 7.0)))
+    make_run(tmp_path, seed=3, returns=((50.0, 50.0),), steps=400)  # not finished
+    make_run(tmp_path, algo="sac", seed=5, returns=((7.0, 9.0),))
+    table = tables.make_returns_table(read_groups(tmp_path)).set_index("algorithm")
+    tdc, sac = table.loc["TDC"], table.loc["SAC"]
+    assert (tdc.seeds, tdc.steps, tdc.episodes, tdc.test_seeds) == (2, 1000, 2, 0)
+    assert (tdc.final_mean, tdc.final_min, tdc.final_max, tdc.best_mean) == (4, 2, 6, 6)
+    assert tdc.final_std == pytest.approx(np.sqrt(8))  # ((2 − 4)² + (6 − 4)²)/1
+    assert (tdc.area_mean, tdc.final_iqm) == (4.5, 4)
+    assert 2 <= tdc.final_iqm_low < tdc.final_iqm_high <= 6
+    assert sac.seeds == 1
+    assert np.isnan([sac.final_std, sac.final_iqm_low, sac.best_std]).all()
+    shown = tables.show_returns(table.reset_index()).set_index("Algorithm")
+    assert shown.loc["TDC", "Final"] == "4 ± 2.8"
+    assert shown.loc["SAC", "Final"] == "8"
+    assert shown.loc["SAC", "IQM [95 %]"] == "–"
+
+
+def test_numbers_to_read():
+    assert tables.number(1234.5) == "1,234"
+    assert tables.number(12.34) == "12.3"
+    assert tables.number(-3) == "−3"
+    assert tables.plus_minus(1000.4, 20.0) == "1,000 ± 20"
+    assert tables.plus_minus(5.0, float("nan")) == "5"
+
+
+def test_published_returns_are_those_of_the_sources(tmp_path):
+    make_run(tmp_path, seed=1, returns=((100.0,),))
+    table = tables.make_published_table(tables.make_returns_table(read_groups(tmp_path))).set_index("Algorithm")
+    assert len(table) == 13 + 1
+    assert table.index[:2].tolist() == ["TDC: this report", "TDC-λ: the GeZo-SAC paper"]
+    assert table.loc["TDC: this report", ["Hopper", "Ant", "Steps", "Seeds"]].tolist() == ["100", "–", "1,000", "1"]
+    tianshou = table.loc["SAC: Tianshou's examples/mujoco"]
+    assert (tianshou["HalfCheetah"], tianshou["Steps"], tianshou["Seeds"]) == ("12,139 ± 1,049", "1M", "10")
+    assert table.loc["MEOW: MEOW's repository", "Steps"] == "1.5M / 1.5M / 4M / 4M / 5M"
+    entries = yaml.safe_load(tables._PUBLISHED.read_text())
+    assert all({"source", "how", "version", "seeds", "steps", "returns"} <= set(entry) for entry in entries)
+
+
+def draw(function, *args, **kwargs):
+    axes = figure.Figure().subplots()
+    function(axes, *args, **kwargs)
+    return axes
+
+
+def test_a_curve_is_the_mean_of_finished_seeds():
+    steps = np.array([10, 20])
+    curve = figures.Curve("TDC", "blue", steps, np.array([[1.0, 3.0], [3.0, 7.0]]), np.array([[100.0, np.nan]]))
+    axes = draw(figures.draw_curves, [curve], "A", "return")
+    lines = [line.get_ydata().tolist() for line in axes.lines]
+    assert lines == [[1, 3], [3, 7], [100], [2, 5]]
+    assert axes.get_legend_handles_labels()[1] == ["TDC · 2 seeds, 1 unfinished"]
+
+
+def test_one_seed_has_no_band():
+    one = figures.Curve("TDC", "blue", np.array([10, 20]), np.array([[1.0, 3.0]]))
+    (band,) = draw(figures.draw_curves, [one], "A", "return").collections
+    assert not np.isfinite(band.get_datalim(band.axes.transData).get_points()).all() or not len(
+        [p for p in band.get_paths() if len(p.vertices)]
+    )
+
+
+def test_the_mean_on_a_logarithmic_axis_is_geometric():
+    curve = figures.Curve("TDC", "blue", np.array([10]), np.array([[1.0], [100.0]]))
+    axes = draw(figures.draw_curves, [curve], "A", "variance", log=True)
+    assert axes.lines[-1].get_ydata() == pytest.approx([10])
+    assert axes.get_yscale() == "log"
+
+
+def test_boxes_pool_episodes_and_dots_are_seeds():
+    returns = np.array([[0.0, 2.0], [4.0, 10.0]])
+    axes = draw(figures.draw_box_plots, ["TDC"], ["blue"], [returns], "A")
+    (dots,) = axes.collections
+    assert dots.get_offsets().tolist() == [[0, 1], [0, 7]]
+    assert any(line.get_ydata().tolist() == [3, 3] for line in axes.lines)  # the median of all four
+    assert "2 seeds" in axes.get_xticklabels()[0].get_text()
+
+
+def test_bins_scale_with_the_run_but_hold_an_evaluation(tmp_path):
+    def width(**kwargs):
+        make_run(tmp_path / str(kwargs), **kwargs)
+        (group,) = read_groups(tmp_path / str(kwargs))
+        return report.bin_width(group)
+
+    assert width(n_timesteps=1_500_000, args={"eval_freq": 20_000}) == 20_000
+    assert width(n_timesteps=1_500_000, args={"eval_freq": 5_000}) == 20_000
+    assert width(n_timesteps=150_000, args={"eval_freq": 500}) == 2_000
+    assert width(n_timesteps=150_000, args={"eval_freq": 20_000}) == 20_000
+    assert width(n_timesteps=150_000, args={"eval_freq": 1_500}) == 1_500  # nearest multiple of 2,000
+
+
+def test_scores_over_tasks_need_two_seeds_of_everything(tmp_path):
+    for env_id in ("Hopper-v4", "Walker2d-v4"):
+        for seed in (1, 2):
+            make_run(tmp_path, env_id=env_id, seed=seed, returns=((10.0 * seed,),), lam=1.0)
+            make_run(tmp_path, algo="sac", env_id=env_id, seed=seed, returns=((10.0 * seed - 10,),))
+    make_run(tmp_path, algo="td3", seed=1)  # one seed: not among them
+    found = report.Report(read_groups(tmp_path), tmp_path).scores()
+    assert set(found) == {"TDC", "SAC"}
+    # Returns 10 and 20 against 0 and 10
+    assert [scores.tolist() for scores in found["TDC"]] == [[0.5, 1], [0.5, 1]]
+    assert [scores.tolist() for scores in found["SAC"]] == [[0, 0.5], [0, 0.5]]
+
+
+def test_what_is_missing_is_said(tmp_path):
+    make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2, steps=400)
+    broken = make_run(tmp_path, seed=3)
+    (broken.path / "Hopper-v4" / "config.yml").write_text("lam: 0.9")  # no n_timesteps
+    runs, unreadable = find_runs(tmp_path)
+    page = report.write_report(runs, unreadable, tmp_path / "out").read_text()
+    assert "1 (+ 1 unfinished)" in page
+    assert "400 of 1,000" in page
+    assert "stopped early; the model was saved" in page
+    assert str(broken.path) in page
+    assert "This version of the package has no MEOW" in page
+    assert "These runs take 0.0667 % of the steps" in page
+    assert "As few as 1 seed a group" in page
+
+
+def test_bad_arguments_are_one_sentence(tmp_path, capsys):
+    for main in (report.main, test_returns.main):
+        with pytest.raises(SystemExit):
+            main([str(tmp_path)])
+        assert "There are no runs in" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        test_returns.main([str(tmp_path), "--episodes", "0"])
+    assert "--episodes must be at least 1" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Real runs: two seeds of two algorithms, a sweep of λ, and both heads."""
+    folder = tmp_path_factory.mktemp("logs")
+    small = ["policy_kwargs:{net_arch: [16]}", "learning_starts:100", "batch_size:16", "train_freq:4"]
+    variants = [("tdc", 1, []), ("tdc", 2, []), ("tdc", 1, ["lam:0.0"]), ("tdc", 1, ["stochastic_actor:true"])]
+    for algo, seed, more in [*variants, ("td3", 1, []), ("td3", 2, [])]:
+        argv = ["--algo", algo, "--env", "Hopper-v4", "-n", 400, "--seed", seed, "-f", folder, "--eval-freq", 200]
+        assert train.main([*map(str, argv), "--verbose", "0", "-params", *small, *more]) == 0
+    return folder
+
+
+def test_returns_are_kept_until_the_model_changes(logs, capsys, monkeypatch):
+    assert test_returns.main([str(logs), "--episodes", "4"]) == 0
+    assert capsys.readouterr().out.count("(4 episodes)") == 6
+    run = find_runs(logs)[0][0]
+    returns = test_returns.read_test_returns(run)
+    assert len(returns) == 4
+    assert len(set(returns)) == 4
+    with monkeypatch.context() as patch:
+        patch.setattr(test_returns, "play_episodes", None)  # nothing is played again
+        assert test_returns.measure_run(run, 3).tolist() == returns[:3].tolist()
+    assert test_returns.measure_run(run, 6)[:4].tolist() == returns.tolist()  # the seeds decide, one by one
+    model = run.folder.model.read_bytes()
+    other = next(r for r in find_runs(logs)[0] if r.algo == run.algo and r.folder != run.folder)
+    run.folder.model.write_bytes(other.folder.model.read_bytes())
+    assert test_returns.read_test_returns(run) is None
+    run.folder.model.write_bytes(model)
+    assert test_returns.read_test_returns(run) is not None
+
+
+def test_a_run_that_cannot_be_tested_does_not_stop_the_others(logs, capsys, monkeypatch):
+    def fail_for_td3(model, env, episodes):
+        if type(model).__name__ == "TD3":
+            raise RuntimeError("no such luck")
+        return np.zeros(episodes)
+
+    monkeypatch.setattr(test_returns, "play_episodes", fail_for_td3)
+    assert test_returns.main([str(logs), "--episodes", "7"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.count("RuntimeError: no such luck") == 2
+    assert captured.out.count("(7 episodes)") == 4
+
+
+def test_from_runs_to_a_page(logs, tmp_path, capsys):
+    for run in find_runs(logs)[0]:
+        test_returns.measure_run(run, 2)
+    assert report.main([str(logs), "-o", str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"""(src|href)=["'](?!data:|#)""", page)  # nothing from elsewhere
+    assert "url(" not in page
+    assert "<script" not in page
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    for stem in ("learning-curve-Hopper-v4", "test-returns-Hopper-v4", "lambda-curves-1-Hopper-v4",
+                 "lambda-sweep-1-Hopper-v4", "heads-1-Hopper-v4", "td-error-variance-Hopper-v4"):  # fmt: skip
+        assert {f"{stem}.{suffix}" for suffix in ("svg", "png", "pdf")} <= names
+        assert f"figures/{stem}.svg" in page
+    table = (tmp_path / "tables" / "returns.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in table[1:]] == ["Hopper-v4"] * 4
+    assert "TDC, λ 0" in page
+    assert "TDC, stochastic head" in page
+    assert all(html.escape(run.command) in page for run in find_runs(logs)[0])
+    assert "stable-baselines3" in page
+    assert "400 steps; bins of 200 steps. Seeds: TDC: 2 (1, 2); TD3: 2 (1, 2)." in page

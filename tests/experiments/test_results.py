@@ -1,0 +1,131 @@
+"""Folders of runs → groups that may be averaged."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from experiments.results import describe, differences, find_runs, group_runs, vary
+from experiments.suites import SUITES, Cell
+from sb3_tdc.run_folder import RunFolder
+
+NETWORKS = {"net_arch": [256, 256], "n_quantiles": 64}
+HOPPER = {
+    "lam": 0.9,
+    "learning_rate": 2e-4,
+    "qf_learning_rate": 2e-4,
+    "policy_kwargs": NETWORKS,
+    "n_timesteps": 1000,
+}
+
+
+def make_run(folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=(), returns=((1.0, 3.0),), **config):
+    """:param steps: taken; None if no model was saved"""
+    run = RunFolder.create(folder, algo, env_id)
+    config = {**(HOPPER if algo == "tdc" else {"n_timesteps": 1000}), **config}
+    run.write_config(config, {"algo": algo, "env": env_id, "seed": seed, **dict(args)})
+    timesteps = np.linspace(0, steps or 500, len(returns) + 1)[1:]
+    np.savez(run.path / "evaluations.npz", timesteps=timesteps, results=returns)
+    if steps is not None:
+        with zipfile.ZipFile(run.model, "w") as archive:
+            archive.writestr("data", json.dumps({"num_timesteps": steps}))
+            archive.writestr("system_info.txt", "- OS: of the test\n- Python: 3\n")
+    return run
+
+
+def labels(folder):
+    return [(group.label, [run.seed for run in group.runs]) for group in group_runs(find_runs(folder)[0])]
+
+
+def test_only_seeds_are_put_together(tmp_path):
+    for seed in (2, 1, 3):
+        make_run(tmp_path, seed=seed)
+    make_run(tmp_path, seed=1, lam=0.5)
+    make_run(tmp_path, seed=1, stochastic_actor=True)
+    make_run(tmp_path, seed=1, policy_kwargs={**NETWORKS, "n_quantiles": 8})
+    make_run(tmp_path, seed=1, args={"env_kwargs": {"reset_noise_scale": 0.0}})
+    make_run(tmp_path, algo="td3", seed=1)
+    assert labels(tmp_path) == [
+        ("TDC", [1, 2, 3]),
+        ("TDC, env_kwargs.reset_noise_scale 0", [1]),
+        ("TDC, n_quantiles 8", [1]),
+        ("TDC, stochastic head", [1]),
+        ("TDC, λ 0.5", [1]),
+        ("TD3", [1]),
+    ]
+
+
+def test_what_is_said_and_what_is_the_default_are_the_same(tmp_path):
+    make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2, gamma=0.99, stochastic_actor=False)  # the constructor's own
+    make_run(tmp_path, seed=3, kappa=1)  # not 1.0, but the same
+    assert labels(tmp_path) == [("TDC", [1, 2, 3])]
+
+
+def test_a_repetition_is_no_other_seed(tmp_path):
+    make_run(tmp_path, seed=1, returns=((1.0,),))
+    make_run(tmp_path, seed=1, returns=((2.0,),))
+    make_run(tmp_path, seed=1, returns=((3.0,),), steps=None)
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    (run,) = group.runs
+    assert run.evaluations.returns.tolist() == [[2.0]]  # the last finished one
+
+
+def test_only_finished_runs_count(tmp_path):
+    make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2, steps=400)
+    make_run(tmp_path, seed=3, steps=None)
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert [run.steps for run in group.runs] == [1000, 400, 500]
+    assert group.seeds == "1 (1)"
+
+
+def test_ablations_differ_in_one_setting_alone(tmp_path):
+    make_run(tmp_path, lam=1.0)
+    make_run(tmp_path, lam=0.25)
+    make_run(tmp_path, lam=0.25, kappa=2.0)
+    make_run(tmp_path, env_id="Ant-v4", lam=0.5)
+    groups = group_runs(find_runs(tmp_path)[0])
+    assert [[group.setting("lam") for group in some] for some in vary(groups, "lam")] == [[0.25, 1.0]]
+    assert [[group.setting("kappa") for group in some] for some in vary(groups, "kappa")] == [[1.0, 2.0]]
+    assert vary(groups, "stochastic_actor") == []
+
+
+def test_what_differs_from_the_hyperparameter_file_is_named(tmp_path):
+    make_run(tmp_path, lam=0.5, learning_starts=100)
+    (run,), _ = find_runs(tmp_path)
+    text = describe(differences(run))
+    assert "steps 1,000" in text
+    assert "λ 0.5" in text
+    assert "learning_starts 100" in text
+    assert "learning_rate" not in text
+    assert "gamma" not in text
+
+
+def test_folders_that_cannot_be_read_do_not_stop_the_others(tmp_path):
+    make_run(tmp_path)
+    broken = make_run(tmp_path, seed=2)
+    (broken.path / "Hopper-v4" / "args.yml").write_text("algo: [")
+    runs, unreadable = find_runs(tmp_path)
+    assert [run.seed for run in runs] == [1]
+    assert len(unreadable) == 1
+    assert str(broken.path) in unreadable[0]
+    with pytest.raises(ValueError, match="There are no runs in"):
+        find_runs(tmp_path / "nothing")
+
+
+def test_cells_of_the_paper():
+    algos = {cell.algo for cell in SUITES["fig1"]}
+    assert algos == {"tdc", "td3", "sac", "ddpg", "meow"}
+    assert len(SUITES["fig1"]) == 25
+    assert [len(SUITES[name]) for name in ("fig2", "fig3", "fig5", "figS1")] == [10, 10, 12, 2]
+
+
+def test_a_run_belongs_to_a_cell_by_lambda_and_head(tmp_path):
+    make_run(tmp_path, lam=0.0)
+    (run,), _ = find_runs(tmp_path)
+    assert Cell("tdc", "Hopper-v4", {"lam": 0.0}).includes(run)
+    assert Cell("tdc", "Hopper-v4", {"stochastic_actor": False}).includes(run)
+    assert not Cell("tdc", "Hopper-v4", {"lam": 1.0}).includes(run)
+    assert not Cell("td3", "Hopper-v4").includes(run)
