@@ -1,0 +1,7 @@
+try:
+    import jinja2  # noqa: F401
+    import matplotlib  # noqa: F401
+    import pandas  # noqa: F401
+    import scipy  # noqa: F401
+except ImportError as error:
+    raise ImportError('The experiments need more packages: pip install "sb3-tdc[report]"') from error

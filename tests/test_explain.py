@@ -182,7 +182,7 @@ def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monke
     monkeypatch.setattr(critic_evaluation, "_EVERY", 1)
     env, eval_env = (VecNormalize(make_env(length=12)) for _ in range(2))
     eval_env.training = eval_env.norm_reward = False
-    model = make_model(env, learning_starts=10, batch_size=4)
+    model = make_model(env, gradient_steps=0)
     model.learn(30, callback=critic_evaluation.CriticEvaluation(
         eval_env, StopOnSignal(), n_eval_episodes=2, eval_freq=30, verbose=0
     ))  # fmt: skip
