@@ -29,6 +29,13 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unknown argument {unknown[0]!r}{suggest(unknown[0], flags)}")
         return parsed
 
+    def parse_given(self, args: Sequence[str] | None = None) -> dict[str, Any]:
+        """:return: the arguments that are on the command line, without the defaults of the others"""
+        absent = object()
+        names = {action.dest for action in self._actions}
+        parsed = self.parse_args(args, argparse.Namespace(**dict.fromkeys(names, absent)))
+        return {name: value for name, value in vars(parsed).items() if value is not absent}
+
     def fail(self, error: Exception) -> NoReturn:
         """Print one sentence and leave with status 2, as for a bad argument."""
         self.exit(2, f"{self.prog}: error: {error}\n")

@@ -3,6 +3,7 @@
 import difflib
 import shutil
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3 import DDPG, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import (
@@ -31,14 +33,14 @@ from stable_baselines3.common.vec_env import (
     VecEnv,
     VecFrameStack,
     VecNormalize,
-    unwrap_vec_normalize,
 )
 
+from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable
 from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.interruption import StopOnSignal, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
-from sb3_tdc.run_folder import RunFolder, save_model
+from sb3_tdc.run_folder import RunFolder, save
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely, read_data
 from sb3_tdc.tdc import TDC
 
@@ -55,6 +57,8 @@ class Experiment:
     :param eval_freq: environment steps between evaluations; 0 or less: none
     :param eval_episodes: episodes per evaluation, with the mean action
     :param save_freq: environment steps between saved models; 0 or less: none
+    :param checkpoint_freq: environment steps between checkpoints to resume from; 0 or less: none
+    :param resume: go on from the newest checkpoint in the folder
     :param tensorboard_log: "" for none; None for the run's own folder
     :param trained_model: a zip to go on from; its replay buffer and normalisation are loaded if they lie beside it
     :param trust: whether ``trained_model`` and what lies beside it may run code, as SB3's ``load`` lets them
@@ -71,6 +75,8 @@ class Experiment:
     n_eval_envs: int = 1
     save_freq: int = -1
     save_replay_buffer: bool = False
+    checkpoint_freq: int = DEFAULT_FREQ
+    resume: bool = False
     vec_env: str = "dummy"
     device: str = "auto"
     env_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -93,10 +99,16 @@ _SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportErro
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended: the trained model, and whether the user stopped it before its last step."""
+    """
+    How a run ended.
+
+    :param interrupted: whether the user stopped it before its last step
+    :param checkpoint: the timestep from which it can be resumed, if it can
+    """
 
     model: OffPolicyAlgorithm
     interrupted: bool
+    checkpoint: int | None
 
 
 def check_env_id(env_id: str) -> None:
@@ -151,6 +163,7 @@ def make_envs(
         monitor_kwargs=hyperparams.monitor_kwargs,
         env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
         vec_env_cls=SubprocVecEnv if vec_env == "subproc" else DummyVecEnv,
+        wrapper_class=Restorable if vec_env == "subproc" else None,
     )
     for wrapper in hyperparams.vec_env_wrapper:
         env = wrapper(env)
@@ -170,13 +183,16 @@ def train(experiment: Experiment) -> Outcome:
     """
     Train from the first step to the last, or to Ctrl-C; either way the model is saved (after a second one, it is not).
 
-    :raises SetupError: if the run cannot begin; its folder is removed
+    :raises SetupError: if the run cannot begin; its folder is removed, if it was made for it
     :raises NonFiniteError: if training diverged; saved models stay as they are
     """
     with ExitStack() as stack:
         try:
             if experiment.trained_model is not None:
                 check_saved_by(experiment.trained_model, experiment.algo)
+            checkpoints = _open_checkpoints(experiment)
+            if checkpoints is not None:
+                stack.callback(checkpoints.store.close)
             env = stack.enter_context(_closing(_make_training_envs(experiment)))
             model = _make_model(experiment, env)
             model.set_logger(_make_logger(experiment))
@@ -185,11 +201,16 @@ def train(experiment: Experiment) -> Outcome:
             if experiment.eval_freq > 0:
                 eval_env = stack.enter_context(_closing(_make_eval_envs(experiment)))
                 eval_env = model._wrap_env(eval_env, verbose=0, monitor_wrapper=False)
-            stop, progress = StopOnSignal(), ProgressCallback(experiment.progress_bar, experiment.verbose)
+            stop = StopOnSignal(checkpoints)
+            progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
             callbacks = [*_make_callbacks(experiment, eval_env, progress, stop), progress, stop]
+            if checkpoints is not None:
+                callbacks.insert(0, checkpoints)
+                checkpoints.restore(model)
         except BaseException as error:
             stack.close()
-            shutil.rmtree(experiment.folder.path)
+            if not experiment.resume:
+                shutil.rmtree(experiment.folder.path)
             if not isinstance(error, (*_SETUP_ERRORS, KeyboardInterrupt)):
                 raise
             raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
@@ -201,7 +222,28 @@ def train(experiment: Experiment) -> Outcome:
                 log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
             )
             _save(experiment, model)
-        return Outcome(model, interrupted=stop.requested)
+        if not stop.requested:
+            experiment.folder.mark_finished(model.num_timesteps)
+            if checkpoints is not None:
+                checkpoints.store.remove_all()
+        return Outcome(model, stop.requested, checkpoints.last_step if checkpoints is not None else None)
+
+
+def _open_checkpoints(experiment: Experiment) -> Checkpoints | None:
+    folder = experiment.folder
+    if experiment.checkpoint_freq <= 0:
+        return None
+    of_evaluations = [folder.best_model, folder.normalization(folder.best_model)]
+    checkpoints = Checkpoints(
+        folder.checkpoint_folder,
+        experiment.checkpoint_freq,
+        files=of_evaluations if experiment.eval_freq > 0 else [],
+        verbose=experiment.verbose,
+    )
+    if experiment.resume and not checkpoints.store.steps():  # stopped before its first step
+        for events in folder.path.glob("events.out.tfevents.*"):
+            events.unlink()
+    return checkpoints
 
 
 def _make_training_envs(experiment: Experiment) -> VecEnv:
@@ -338,12 +380,11 @@ def _make_callbacks(
             CriticEvaluation(
                 eval_env,
                 stop,
-                callback_on_new_best=_SaveNormalization(folder.normalization(folder.best_model)),
+                callback_on_new_best=_SaveBest(folder),
                 callback_after_eval=progress.evaluation,
                 n_eval_episodes=experiment.eval_episodes,
                 eval_freq=calls(experiment.eval_freq),
                 log_path=str(folder.path),
-                best_model_save_path=str(folder.path),
                 deterministic=True,
                 verbose=0,
             )
@@ -353,12 +394,16 @@ def _make_callbacks(
 
 def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
     folder = experiment.folder
-    save_model(model, folder.model)
+    _save_model(model, folder, folder.model)
+    if experiment.save_replay_buffer:
+        save(model.save_replay_buffer, folder.replay_buffer(folder.model))
+
+
+def _save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
+    save(model.save, path)
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        normalization.save(str(folder.normalization(folder.model)))
-    if experiment.save_replay_buffer:
-        model.save_replay_buffer(folder.replay_buffer(folder.model))
+        save(lambda beside: normalization.save(str(beside)), folder.normalization(path))
 
 
 @contextmanager
@@ -375,17 +420,18 @@ def _closing(env: VecEnv) -> Iterator[VecEnv]:
             env.close()
 
 
-class _SaveNormalization(BaseCallback):
-    """Save the statistics of ``VecNormalize`` beside a new best model."""
+class _SaveBest(BaseCallback):
+    """Save a new best model, and the statistics of ``VecNormalize``. A full disk does not end training."""
 
-    def __init__(self, path: Path):
+    def __init__(self, folder: RunFolder):
         super().__init__()
-        self.path = path
+        self.folder = folder
 
     def _on_step(self) -> bool:
-        normalization = unwrap_vec_normalize(self.training_env)
-        if normalization is not None:
-            normalization.save(str(self.path))
+        try:
+            _save_model(self.model, self.folder, self.folder.best_model)
+        except OSError as error:
+            warnings.warn(f"The best model of step {self.num_timesteps:,} was not saved: {error}", stacklevel=2)
         return True
 
 

@@ -3,13 +3,18 @@
 import signal
 import sys
 import threading
+import time
 from types import FrameType, TracebackType
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdc.checkpoint import Checkpoints
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# How long a rollout may take to its end, where a checkpoint can be written
+_PATIENCE_SECONDS = 5.0
 
 
 class StopOnSignal(BaseCallback):
@@ -17,11 +22,19 @@ class StopOnSignal(BaseCallback):
     As a context, it takes SIGINT and SIGTERM; as a callback, it ends training after one. A second one interrupts.
 
     An exception raised by a handler, anywhere, could leave a step of processes half received or a file half written.
+
+    :param checkpoints: write one first, when the next rollout starts, if that is soon
     """
 
-    def __init__(self) -> None:
+    is_checkpointed = False
+
+    def __init__(self, checkpoints: Checkpoints | None = None) -> None:
         super().__init__()
         self.requested = False
+        self.checkpoints = checkpoints
+        self.deadline = 0.0
+        if checkpoints is not None:
+            checkpoints.is_wanted = lambda: self.requested
 
     def __enter__(self) -> "StopOnSignal":
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
@@ -40,10 +53,15 @@ class StopOnSignal(BaseCallback):
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+        self.deadline = time.monotonic() + _PATIENCE_SECONDS
         print("\nStopping after this step; once more to stop without saving.", file=sys.stderr, flush=True)
 
+    def _on_rollout_start(self) -> None:
+        if self.requested and self.checkpoints is not None and self.checkpoints.last_step == self.model.num_timesteps:
+            self.deadline = 0.0  # it is written
+
     def _on_step(self) -> bool:
-        return not self.requested
+        return not self.requested or (self.checkpoints is not None and time.monotonic() < self.deadline)
 
 
 class StoppableEvaluation(EvalCallback):

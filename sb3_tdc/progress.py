@@ -21,6 +21,8 @@ class ProgressCallback(BaseCallback):
     :raises ImportError: if there is to be a bar and tqdm is missing, with the command that installs it
     """
 
+    is_checkpointed = False
+
     def __init__(self, bar: bool, verbose: int = 1):
         super().__init__(verbose)
         self.bar: Any = None

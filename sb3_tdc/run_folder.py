@@ -5,12 +5,12 @@ import re
 import shlex
 import sys
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_tdc.hyperparams import suggest
 
@@ -90,6 +90,23 @@ class RunFolder:
         """The command line arguments."""
         return _read_yaml(self.path / self.env_name / "args.yml")
 
+    @property
+    def checkpoint_folder(self) -> Path:
+        """Where the checkpoints of a run that goes on are."""
+        return self.path / "checkpoints"
+
+    @property
+    def is_finished(self) -> bool:
+        return self._finished.is_file()
+
+    @property
+    def _finished(self) -> Path:
+        return self.path / self.env_name / "finished.yml"
+
+    def mark_finished(self, n_timesteps: int) -> None:
+        """The last step has been done, and the model saved."""
+        self._finished.write_text(yaml.safe_dump({"n_timesteps": n_timesteps}))
+
     def checkpoints(self) -> dict[int, Path]:
         """:return: the model of every checkpoint, by timestep, oldest first"""
         found = {}
@@ -122,11 +139,18 @@ class RunFolder:
         (folder / "command.txt").write_text(shlex.join(sys.orig_argv) + "\n")
 
 
-def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Save beside, then rename: a file that is already there stays whole until the new one is."""
-    beside = path.with_name(f".{path.stem}.part.zip")
-    model.save(beside)
-    os.replace(beside, path)
+def save(save_as: Callable[[Path], Any], path: Path) -> None:
+    """
+    Save beside, then rename: a file that is already there stays whole until the new one is.
+
+    :param save_as: what writes the file
+    """
+    beside = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        save_as(beside)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
 
 
 class _PlainLoader(yaml.SafeLoader):

@@ -8,13 +8,15 @@ import time
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments
-from sb3_tdc.experiment import ALGORITHMS, Experiment, SetupError, check_env_id, train
+from sb3_tdc.checkpoint import DEFAULT_FREQ
+from sb3_tdc.experiment import ALGORITHMS, Experiment, Outcome, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.run_folder import RunFolder
 from sb3_tdc.tdc import NonFiniteError
@@ -34,6 +36,8 @@ def make_parser() -> Parser:
     add("--eval-episodes", type=int, default=5, help="episodes per evaluation")
     add("--n-eval-envs", type=int, default=1, help="environments for evaluation")
     add("--save-freq", type=int, default=-1, help="save the model every so many steps (-1: only at the end)")
+    add("--checkpoint-freq", type=int, default=DEFAULT_FREQ, help="steps between checkpoints to resume from (-1: none)")
+    add("--resume", type=Path, metavar="RUN_FOLDER", help="go on with a stopped run; it has all other arguments")
     add("--save-replay-buffer", action="store_true", help="save the replay buffer with the model")
     add("--log-interval", type=int, default=-1, help="episodes between log entries (-1: 4, 0: no log)")
     add("-tb", "--tensorboard-log", help='TensorBoard folder (none given: the run\'s own; "": off)')
@@ -82,17 +86,59 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(args, name)}")
     if args.trained_agent is not None and not (args.trained_agent.suffix == ".zip" and args.trained_agent.is_file()):
         raise ValueError(f"-i must be the zip of a model, got {args.trained_agent}")
-    progress_bar = args.progress
-    if progress_bar is None:
-        progress_bar = sys.stderr.isatty() and _has_tqdm(args.verbose)
     if args.seed < 0:
         args.seed = int(np.random.randint(2**31 - 1))
     hyperparams = read_hyperparams(args)
-    set_random_seed(args.seed)
 
     folder = RunFolder.create(args.log_folder, args.algo, args.env, args.uuid)
-    arguments = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
-    folder.write_config(hyperparams.raw, arguments)
+    folder.write_config(hyperparams.raw, _plain(args))
+    return _experiment(args, hyperparams, folder)
+
+
+def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experiment | None:
+    """
+    The experiment of a run folder, and in ``args`` its arguments.
+
+    :param given: what the command line says
+    :return: None if the run is finished
+    :raises ValueError: if there is nothing to resume, or an argument contradicts the run's
+    """
+    folder = RunFolder.open(args.resume)
+    try:
+        stored = folder.args
+    except OSError as error:
+        raise ValueError(f"{folder.path} was stopped before its run began: start it anew ({error})") from error
+    for name, value in _plain(argparse.Namespace(**given)).items():
+        if name in stored and name not in _OF_THE_PROCESS and value != stored[name]:
+            flag = f"--{name.replace('_', '-')}"
+            raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {stored[name]}")
+    resumed = {**stored, **{name: value for name, value in given.items() if name in (*_OF_THE_PROCESS, "resume")}}
+    vars(args).update(resumed)
+    if folder.is_finished:
+        return None
+    if stored.get("checkpoint_freq", 0) <= 0:
+        raise ValueError(f"{folder.path} has no checkpoints: it was made without --checkpoint-freq")
+    args.trained_agent = Path(args.trained_agent) if args.trained_agent is not None else None
+    apply_common_arguments(args, args.env)
+    check_env_id(args.env)
+    where = folder.path / folder.env_name / "config.yml"
+    return _experiment(args, parse(folder.config, ALGORITHMS[args.algo], str(where)), folder)
+
+
+# What may differ when a run is resumed
+_OF_THE_PROCESS = ("num_threads", "device", "verbose", "progress")
+
+
+def _plain(args: argparse.Namespace) -> dict[str, Any]:
+    """As they are written to the run folder."""
+    return {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+
+
+def _experiment(args: argparse.Namespace, hyperparams: Hyperparams, folder: RunFolder) -> Experiment:
+    set_random_seed(args.seed)
+    progress_bar = args.progress
+    if progress_bar is None:
+        progress_bar = sys.stderr.isatty() and _has_tqdm(args.verbose)
     return Experiment(
         algo=args.algo,
         env_id=args.env,
@@ -104,6 +150,8 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
         n_eval_envs=args.n_eval_envs,
         save_freq=args.save_freq,
         save_replay_buffer=args.save_replay_buffer,
+        checkpoint_freq=args.checkpoint_freq,
+        resume=args.resume is not None,
         vec_env=args.vec_env,
         device=args.device,
         env_kwargs=args.env_kwargs,
@@ -142,15 +190,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: 0, 1 if training diverged, 130 if the user stopped it
     """
     parser = make_parser()
-    args = parser.parse_args(argv)
+    args, given = parser.parse_args(argv), parser.parse_given(argv)
     start = time.monotonic()
     try:
-        experiment = make_experiment(args)
+        experiment = make_experiment(args) if args.resume is None else resume_experiment(args, given)
     except ValueError as error:
         parser.fail(error)
+    if experiment is None:
+        print(f"{args.resume} is finished: there is nothing to resume")
+        return 0
     folder = experiment.folder
     if args.verbose > 0:
-        print(f"Training {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
+        verb = "Training" if args.resume is None else "Resuming"
+        print(f"{verb} {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
     try:
         outcome = train(experiment)
     except SetupError as error:
@@ -164,15 +216,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.verbose > 0:
         print(f"Saved {folder.model} after {timedelta(seconds=round(time.monotonic() - start))}")
     if outcome.interrupted:
-        steps, total = outcome.model.num_timesteps, experiment.hyperparams.n_timesteps
-        experience = "with" if args.save_replay_buffer else "without (--save-replay-buffer keeps it)"
-        print(f"Stopped at step {steps:,} of {total:,}. To go on in a new run, {experience} the replay buffer:")
-        print(f"  python train.py {_command_to_go_on(argv, total - steps, folder.model)}")
+        _say_how_to_go_on(argv, args, experiment, outcome)
         return 130
     if args.verbose > 0:
         packages = f" --gym-packages {shlex.join(args.gym_packages)}" if args.gym_packages else ""
         print(f"To watch it: python enjoy.py {folder.path}{packages}")
     return 0
+
+
+def _say_how_to_go_on(
+    argv: Sequence[str] | None, args: argparse.Namespace, experiment: Experiment, outcome: Outcome
+) -> None:
+    steps, total = outcome.model.num_timesteps, experiment.hyperparams.n_timesteps
+    folder = experiment.folder
+    if outcome.checkpoint is not None:
+        print(f"Stopped at step {steps:,} of {total:,}. To go on from step {outcome.checkpoint:,}:")
+        print(f"  python train.py --resume {shlex.quote(str(folder.path))}")
+    else:
+        experience = "with" if args.save_replay_buffer else "without (--save-replay-buffer keeps it)"
+        print(f"Stopped at step {steps:,} of {total:,}. To go on in a new run, {experience} the replay buffer:")
+        print(f"  python train.py {_command_to_go_on(argv, total - steps, folder.model)}")
 
 
 if __name__ == "__main__":

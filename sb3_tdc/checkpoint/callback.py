@@ -1,0 +1,243 @@
+"""The callback that writes checkpoints and restores them."""
+
+import json
+import os
+import shutil
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_tdc.checkpoint import replay, state
+from sb3_tdc.checkpoint.codec import NotRestoredError
+from sb3_tdc.checkpoint.store import Store, Stored
+
+DEFAULT_FREQ = 10_000
+
+
+class Checkpoints(BaseCallback):
+    """
+    Checkpoints from which a run goes on as if it had never been stopped. The first of the callbacks::
+
+        checkpoints = Checkpoints("my_run/checkpoints")
+        checkpoints.restore(model)  # nothing happens if there are none yet
+        model.learn(1_000_000, callback=[checkpoints, ...])
+
+    One is written before the first step, then every ``freq`` steps, when a rollout starts: at no other moment is all
+    that counts in the objects.
+
+    :param folder: of the checkpoints; of one run
+    :param freq: environment steps between checkpoints, at least
+    :param keep: how many of the newest stay on disk
+    :param files: files that callbacks rewrite and that belong to the state; those of an ``EvalCallback`` do
+    :param verbose: 0: no messages but warnings
+    :raises ValueError: if ``freq`` or ``keep`` is below 1, or another process writes to the folder
+    """
+
+    is_checkpointed = False
+
+    def __init__(
+        self,
+        folder: str | Path,
+        freq: int = DEFAULT_FREQ,
+        keep: int = 2,
+        files: Iterable[str | Path] = (),
+        verbose: int = 1,
+    ):
+        super().__init__(verbose)
+        for name, value in (("freq", freq), ("keep", keep)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        self.freq, self.files = freq, [Path(file) for file in files]
+        self.store = Store(Path(folder), keep)
+        self.is_wanted: Callable[[], bool] = lambda: False
+        self.last_step: int | None = None  # of the newest checkpoint
+        self.seconds = 0.0  # that training has waited for checkpoints
+        self._to_restore: Stored | None = None
+        self._parts: dict[str, Any] = {}
+        self._segments: list[replay.Segment] = []
+        self._digests: dict[str, str] = {}
+        self._before: tuple[int, int] | None = None  # position in the replay buffer and timestep of the last segment
+        self._kept: dict[Path, tuple[os.stat_result, Path]] = {}
+
+    # ---------------------------------------------------------------- restoring
+
+    def restore(self, model: OffPolicyAlgorithm) -> int | None:
+        """
+        Choose the newest intact checkpoint; the next ``model.learn`` goes on from it.
+
+        :param model: built as for the first run, with its environments
+        :return: the timestep it will go on from, None if there is no checkpoint yet
+        :raises ValueError: if it is of another algorithm or environment, or if there are some and none is intact
+        """
+        stored = self.store.newest()
+        if stored is None:
+            return None
+        parts = json.loads((stored.path / "state.json").read_text())
+        for name, now in state.describe_run(model).items():
+            if parts["run"][name] != now:
+                difference = "is another" if name == "network" else f"was {parts['run'][name]}, and is {now}"
+                raise ValueError(f"{stored.path} is of another run: the {name} {difference}")
+        self._to_restore, self._parts = stored, parts
+        return stored.step
+
+    def _on_training_start(self) -> None:
+        self.root: BaseCallback = self.locals["callback"]
+        if self._to_restore is None:
+            newest = max(self.store.steps(), default=None)
+            if newest is not None and newest != self.last_step:
+                raise ValueError(
+                    f"{self.store.folder} has checkpoints of a run already: call restore(model) to go on from them, "
+                    "or choose another folder"
+                )
+            return
+        self.model.num_timesteps = self._to_restore.step  # for the callbacks behind this one
+        if self._to_restore.step >= self.locals["total_timesteps"]:
+            self._restore()  # there will be no rollout
+
+    def _restore(self) -> None:
+        stored, parts = self._to_restore, self._parts
+        assert stored is not None
+        model: Any = self.model
+        self._segments = [replay.Segment(**segment) for segment in parts["segments"]]
+        replay.read_segments(model.replay_buffer, ((s, stored.shared_file(s.name)) for s in self._segments))
+        weights = th.load(stored.path / "weights.pt", map_location=model.device, weights_only=True)
+        state.restore_weights(model, weights)
+        with np.load(stored.path / "arrays.npz", allow_pickle=False) as arrays:
+            numbered = [arrays[str(i)] for i in range(len(arrays.files))]
+        restarted = state.restore_state(model, self.root, parts["state"], numbered, stored.step)
+        self._put_files_back(stored, parts["files"])
+        self.store.remove_after(stored.step)
+        self._digests, self.last_step = dict(stored.shared), stored.step
+        self._before = model.replay_buffer.pos, stored.step
+        if restarted:  # the end of an episode was written into the last slot
+            self._before = (model.replay_buffer.pos - 1) % model.replay_buffer.buffer_size, stored.step - model.n_envs
+        self._to_restore = None
+        self._tell_what_differs(parts["platform"], restarted)
+
+    def _tell_what_differs(self, platform: dict[str, str], restarted: list[str]) -> None:
+        now = state.describe_platform(self.model)  # type: ignore[arg-type]
+        differences = [
+            f"{name} was {platform[name]}, is {now[name]}" for name in now if platform.get(name) != now[name]
+        ]
+        if differences:
+            warnings.warn(
+                f"Going on is exact on the same platform only: {'; '.join(differences)}", RuntimeWarning, stacklevel=2
+            )
+        if restarted:
+            warnings.warn(
+                f"Going on with new episodes, as not all of an environment could be restored: {restarted[0]}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        if self.verbose > 0:
+            print(f"Going on from step {self.last_step:,}", flush=True)
+
+    # ---------------------------------------------------------------- saving
+
+    def _on_rollout_start(self) -> None:
+        if self._to_restore is not None:
+            self._restore()
+            return
+        step = self.model.num_timesteps
+        due = self.last_step is None or step - self.last_step >= self.freq
+        if (due or self.is_wanted()) and step != self.last_step:
+            start = time.perf_counter()
+            self._save(step)
+            self.seconds += time.perf_counter() - start
+
+    def _save(self, step: int) -> None:
+        first = self.last_step is None
+        try:
+            self._write(step)
+        except OSError as error:
+            warnings.warn(
+                f"The checkpoint of step {step:,} could not be written ({error}). Training goes on; "
+                + ("there is none yet" if first else f"that of step {self.last_step:,} stays"),
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+    def _write(self, step: int) -> None:
+        model: Any = self.model
+        parts, context = state.capture_state(model, self.root)
+        segments, digests = self._write_segment(step)
+        files = [*self.files, *state.files_of_evaluations(self.root)]
+        content = {
+            "run": state.describe_run(model),
+            "platform": state.describe_platform(model),
+            "state": parts,
+            "segments": [asdict(segment) for segment in segments],
+            "files": [str(i) if file.exists() else None for i, file in enumerate(files)],
+        }
+        weights = state.capture_weights(model)
+        arrays = {str(i): array for i, array in enumerate(context.arrays)}
+        writers: dict[str, Any] = {
+            "state.json": lambda path: path.write_text(json.dumps(content)),
+            "arrays.npz": lambda path: np.savez(path, **arrays),  # type: ignore[arg-type]
+            "weights.pt": lambda path: th.save(weights, path),
+        }
+        stats = {file: file.stat() for file in files if file.exists()}
+        writers |= {f"file_{i}": self._copier(file) for i, file in enumerate(files) if file in stats}
+        stored = self.store.write(step, writers, digests)
+        if self.last_step is None and self.verbose > 0:
+            for why in dict.fromkeys(context.left_out):
+                print(f"Not in the checkpoints: {why}")
+        self._segments, self._digests, self.last_step = segments, digests, step
+        self._before = model.replay_buffer.pos, step
+        self._kept = {file: (stats[file], stored.path / f"file_{i}") for i, file in enumerate(files) if file in stats}
+        self.store.remove_old()
+
+    def _write_segment(self, step: int) -> tuple[list[replay.Segment], dict[str, str]]:
+        model: Any = self.model
+        buffer = model.replay_buffer
+        segments = self._segments
+        first, last_step = self._before or (None, step)
+        new = replay.new_segment(buffer, f"step_{step:012d}.npz", first, (step - last_step) // model.n_envs)
+        if new is None:
+            return segments, self._digests
+        digest = self.store.write_shared(new.name, replay.write_segment(buffer, new))
+        segments = replay.needed([*segments, new], buffer.buffer_size)
+        digests = {**self._digests, new.name: digest}
+        return segments, {segment.name: digests[segment.name] for segment in segments}
+
+    def _copier(self, file: Path) -> Callable[[Path], None]:
+        """A link to the last checkpoint's copy if the file has not changed since."""
+
+        def copy(path: Path) -> None:
+            now = file.stat()
+            if file in self._kept and _identity(self._kept[file][0]) == _identity(now):
+                try:
+                    os.link(self._kept[file][1], path)
+                    return
+                except OSError:
+                    pass  # a file system without links
+            shutil.copyfile(file, path)
+
+        return copy
+
+    def _put_files_back(self, stored: Stored, saved: list[str | None]) -> None:
+        files = [*self.files, *state.files_of_evaluations(self.root)]
+        if len(files) != len(saved):
+            raise NotRestoredError(f"{stored.path} has {len(saved)} files of callbacks, this run has {len(files)}")
+        for file, number in zip(files, saved, strict=True):
+            if number is None:
+                file.unlink(missing_ok=True)
+            else:
+                beside = file.with_name(f".{file.name}.part")
+                shutil.copyfile(stored.path / f"file_{number}", beside)
+                os.replace(beside, file)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def _identity(stat: os.stat_result) -> tuple[int, ...]:
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns

@@ -1,0 +1,49 @@
+"""TensorBoard's event files: cut back to where they were, and continued in a new one without a gap or a duplicate."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+
+def capture_event_files(output: TensorBoardOutputFormat) -> dict[str, Any]:
+    """:return: the folder and the size of every event file in it, in bytes"""
+    output.writer.flush()
+    folder = Path(output.writer.log_dir)
+    sizes = {}
+    for path in _event_files(folder):
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+        sizes[path.name] = path.stat().st_size
+    return {"folder": str(folder.resolve()), "sizes": sizes}
+
+
+def restore_event_files(output: TensorBoardOutputFormat, state: dict[str, Any], step: int) -> None:
+    """
+    What this process has written so far is dropped, and what was written after the state was captured.
+
+    :param step: a TensorBoard that watches is told to forget what it has seen beyond
+    """
+    from torch.utils.tensorboard.writer import SummaryWriter
+
+    output.writer.close()
+    opened, folder = Path(output.writer.log_dir).resolve(), Path(state["folder"])
+    if not folder.is_dir():  # the run was moved
+        folder = opened
+    for path in _event_files(folder):
+        if path.name not in state["sizes"]:
+            path.unlink()
+        elif path.stat().st_size > state["sizes"][path.name]:
+            os.truncate(path, state["sizes"][path.name])
+    if opened != folder:  # made for this process
+        for path in _event_files(opened):
+            path.unlink()
+        with suppress(OSError):
+            opened.rmdir()
+    output.writer = SummaryWriter(str(folder), purge_step=step + 1)
+
+
+def _event_files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("events.out.tfevents.*"))

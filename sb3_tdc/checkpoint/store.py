@@ -1,0 +1,233 @@
+"""
+Directories that are there whole or not at all.
+
+``<folder>/step_000000010000/`` holds the files of one checkpoint and, written last, ``manifest``: their SHA-256, and
+those of the shared files in ``<folder>/replay/`` that it needs. Everything is written beside, synced, and renamed.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Writer = Callable[[Path], Any]
+
+_FORMAT = 1
+_MANIFEST = "manifest"
+_SHARED = "replay"
+_STEP = re.compile(r"step_(\d{12,})")
+
+
+class BrokenCheckpointError(ValueError):
+    """A checkpoint that is not as it was written; the message says which file."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """
+    One checkpoint on disk, verified.
+
+    :param step: its timestep
+    :param path: its folder
+    :param shared: SHA-256 of the shared files that it needs, by name
+    """
+
+    step: int
+    path: Path
+    shared: dict[str, str]
+
+    def shared_file(self, name: str) -> Path:
+        """:return: the path of a shared file"""
+        return self.path.parent / _SHARED / name
+
+
+class Store:
+    """
+    The checkpoints of one run.
+
+    :param folder: made if it is missing
+    :param keep: how many of the newest stay
+    :raises ValueError: if another process writes there
+    """
+
+    def __init__(self, folder: Path, keep: int):
+        self.folder, self.keep = folder, keep
+        (folder / _SHARED).mkdir(parents=True, exist_ok=True)
+        self._lock = _lock(folder / "lock")
+
+    def close(self) -> None:
+        """Let another process write there."""
+        self._lock.close()
+
+    def steps(self) -> list[int]:
+        """:return: of all that is there, intact or not, newest first"""
+        found = [_STEP.fullmatch(path.name) for path in self.folder.iterdir()]
+        return sorted((int(match[1]) for match in found if match), reverse=True)
+
+    def newest(self) -> Stored | None:
+        """
+        :return: the newest intact checkpoint, or None if there is none at all; broken ones are named in a warning
+        :raises BrokenCheckpointError: if there are some, and none is intact
+        """
+        reasons = []
+        for step in self.steps():
+            try:
+                stored = self._verify(step)
+            except BrokenCheckpointError as error:
+                reasons.append(str(error))
+                continue
+            for reason in reasons:
+                warnings.warn(f"{reason}; going back to the checkpoint of step {step:,}", RuntimeWarning, stacklevel=2)
+            return stored
+        if reasons:
+            raise BrokenCheckpointError(f"No checkpoint in {self.folder} is intact: {'; '.join(reasons)}")
+        return None
+
+    def _read_manifest(self, step: int) -> dict[str, Any]:
+        path = self._path(step) / _MANIFEST
+        try:
+            text, digest = path.read_text().splitlines()
+        except (OSError, ValueError) as error:
+            raise BrokenCheckpointError(f"{path} is missing or damaged") from error
+        if hashlib.sha256(text.encode()).hexdigest() != digest:
+            raise BrokenCheckpointError(f"{path} is damaged")
+        manifest = json.loads(text)
+        if manifest["format"] != _FORMAT:
+            raise BrokenCheckpointError(f"{path} is of format {manifest['format']}, this version reads {_FORMAT}")
+        return manifest
+
+    def _verify(self, step: int) -> Stored:
+        path, manifest = self._path(step), self._read_manifest(step)
+        stored = Stored(step, path, manifest["shared"])
+        files = {path / name: digest for name, digest in manifest["files"].items()}
+        for file, digest in [*files.items(), *((stored.shared_file(n), d) for n, d in stored.shared.items())]:
+            try:
+                intact = _sha256(file) == digest
+            except OSError as error:
+                raise BrokenCheckpointError(f"{file} cannot be read ({error.strerror})") from error
+            if not intact:
+                raise BrokenCheckpointError(f"{file} is damaged")
+        return stored
+
+    def write_shared(self, name: str, write: Writer) -> str:
+        """
+        :return: the SHA-256 of the file
+        :raises OSError: if it cannot be written; nothing of it stays
+        """
+        path = self.folder / _SHARED / name
+        beside = path.with_name(f".{name}")
+        try:
+            digest = _write(beside, write)
+            os.replace(beside, path)
+            _sync_folder(path.parent)
+        except BaseException:
+            beside.unlink(missing_ok=True)
+            raise
+        return digest
+
+    def write(self, step: int, files: dict[str, Writer], shared: dict[str, str]) -> Stored:
+        """
+        :param files: what writes each file, by name
+        :param shared: SHA-256 of the shared files that it needs, by name
+        :raises OSError: if it cannot be written; nothing of it stays, and what was there stays
+        """
+        path = self._path(step)
+        beside = path.with_name(f".{path.name}")
+        shutil.rmtree(beside, ignore_errors=True)
+        try:
+            beside.mkdir()
+            digests = {name: _write(beside / name, write) for name, write in files.items()}
+            text = json.dumps({"format": _FORMAT, "step": step, "files": digests, "shared": shared})
+            manifest = f"{text}\n{hashlib.sha256(text.encode()).hexdigest()}\n"
+            _write(beside / _MANIFEST, lambda file: file.write_text(manifest))
+            _sync_folder(beside)
+            os.replace(beside, path)
+            _sync_folder(self.folder)
+        except BaseException:
+            shutil.rmtree(beside, ignore_errors=True)
+            raise
+        return Stored(step, path, shared)
+
+    def remove_after(self, step: int) -> None:
+        """Remove the checkpoints (broken ones) beyond the one that was restored."""
+        for later in self.steps():
+            if later > step:
+                self._remove(later)
+
+    def remove_old(self) -> None:
+        """Keep the newest, and the shared files that they need."""
+        kept, old = self.steps()[: self.keep], self.steps()[self.keep :]
+        for step in old:
+            self._remove(step)
+        for path in self.folder.glob(".step_*"):
+            shutil.rmtree(path, ignore_errors=True)
+        needed = set()
+        for step in kept:
+            with suppress(BrokenCheckpointError):
+                needed |= set(self._read_manifest(step)["shared"])
+        for path in (self.folder / _SHARED).iterdir():
+            if path.name not in needed:
+                path.unlink(missing_ok=True)
+
+    def remove_all(self) -> None:
+        """Remove the folder."""
+        for step in self.steps()[::-1]:
+            self._remove(step)
+        self.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _remove(self, step: int) -> None:
+        path = self._path(step)
+        beside = path.with_name(f".{path.name}")
+        shutil.rmtree(beside, ignore_errors=True)
+        os.replace(path, beside)  # at once: what is half removed must not be taken for a broken one
+        shutil.rmtree(beside, ignore_errors=True)
+
+    def _path(self, step: int) -> Path:
+        return self.folder / f"step_{step:012d}"
+
+
+def _write(path: Path, write: Writer) -> str:
+    write(path)
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    return _sha256(path)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _sync_folder(path: Path) -> None:
+    if os.name == "nt":  # a folder cannot be opened there
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(path: Path) -> Any:
+    file = path.open("w")
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise ValueError(f"Another process writes checkpoints to {path.parent}") from None
+    return file
