@@ -4,7 +4,6 @@ import hashlib
 from typing import Any
 
 import gymnasium as gym
-from gymnasium import spaces
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
@@ -119,7 +118,6 @@ def _restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
 
 
 def _capture_vec_env(context: Capture, env: Any, path: str) -> Any:
-    """What else a ``DummyVecEnv`` or ``SubprocVecEnv`` has is overwritten by the next step."""
     if isinstance(env, DummyVecEnv):
         states = [capture_env(single) for single in env.envs]
     elif env.has_attr("capture_state"):
@@ -132,12 +130,12 @@ def _capture_vec_env(context: Capture, env: Any, path: str) -> Any:
     for state in states:
         numbers = [context.add_array(array) for array in state["arrays"]]
         captured.append({"why": state["why"], "content": state["content"], "arrays": numbers})
-    return [captured, context.capture(_spaces(env), path)]
+    return [captured, context.capture_attributes(_own_attributes(env), path)]
 
 
 def _restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
     env = existing_as((DummyVecEnv, SubprocVecEnv), existing, path)
-    captured, spaces_node = content
+    captured, attributes = content
     if len(captured) != env.num_envs:
         raise NotRestoredError(f"{path} had {len(captured)} environments, and has {env.num_envs}")
     states = [{**state, "arrays": [context.arrays[number] for number in state["arrays"]]} for state in captured]
@@ -148,7 +146,7 @@ def _restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -
     else:
         whys = [state["why"] or "there is no sb3_tdc.checkpoint.Restorable around it" for state in states]
     context.restarted += [f"{path}, environment {i}: {why}" for i, why in enumerate(whys) if why is not None]
-    context.restore(spaces_node, _spaces(env), path)
+    context.restore_attributes(attributes, env, path)
     return existing
 
 
@@ -158,8 +156,10 @@ def _restore_event_files(context: Restore, content: Any, existing: Any, path: st
     return output
 
 
-def _spaces(env: VecEnv) -> list[spaces.Space]:
-    return [env.observation_space, env.action_space]
+def _own_attributes(env: VecEnv) -> dict[str, Any]:
+    """What else there is is overwritten by every step."""
+    names = ("observation_space", "action_space", "_seeds", "_options")
+    return {name: vars(env)[name] for name in names}
 
 
 def _is_vec_env(value: Any) -> bool:

@@ -114,7 +114,11 @@ OTHERS = {
         Reach, policy="MultiInputPolicy", kwargs={**_HER, "replay_buffer_kwargs": {"copy_info_dict": True}}
     ),
     "schedules, train_freq": Case(
-        kwargs={"lam": LinearSchedule(1, 0, 1), "learning_rate": lambda left: 1e-3 * left, "train_freq": (7, "step")}
+        kwargs={
+            "lam": LinearSchedule(1, 0, 1),
+            "learning_rate": lambda left: 1e-3 * max(left, 0),
+            "train_freq": (7, "step"),
+        }
     ),
     "episodes": Case("Hopper-v4", kwargs={"train_freq": (2, "episode"), "gradient_steps": -1}),
     "OU noise": Case(
@@ -175,7 +179,7 @@ def digest(value: Any) -> str:
 
     def add(item: Any) -> None:
         if isinstance(item, dict):
-            for key in item:
+            for key in (key for key in item if key not in _TIMES):
                 hashed.update(repr(key).encode())
                 add(item[key])
         elif isinstance(item, (list, tuple)):
