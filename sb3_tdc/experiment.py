@@ -368,7 +368,7 @@ def _make_callbacks(
 
     if experiment.save_freq > 0:
         callbacks.append(
-            CheckpointCallback(
+            _SavePeriodically(
                 calls(experiment.save_freq),
                 str(folder.path),
                 save_replay_buffer=experiment.save_replay_buffer,
@@ -430,9 +430,24 @@ class _SaveBest(BaseCallback):
     def _on_step(self) -> bool:
         try:
             _save_model(self.model, self.folder, self.folder.best_model)
-        except OSError as error:
+        except _DISK_ERRORS as error:
             warnings.warn(f"The best model of step {self.num_timesteps:,} was not saved: {error}", stacklevel=2)
         return True
+
+
+class _SavePeriodically(CheckpointCallback):
+    """The same for the models of ``--save-freq``."""
+
+    def _on_step(self) -> bool:
+        try:
+            return super()._on_step()
+        except _DISK_ERRORS as error:
+            warnings.warn(f"The model of step {self.num_timesteps:,} was not saved: {error}", stacklevel=2)
+        return True
+
+
+# A full disk; PyTorch reports it in its own way
+_DISK_ERRORS = (OSError, RuntimeError)
 
 
 class _HParamsCallback(BaseCallback):

@@ -4,6 +4,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -81,6 +82,9 @@ class StoppableEvaluation(EvalCallback):
             return super()._on_step()
         except _EvaluationStoppedError:
             return False
+        except OSError as error:  # a full disk
+            warnings.warn(f"The evaluation of step {self.num_timesteps:,} was not written: {error}", stacklevel=2)
+            return True
 
 
 class _EvaluationStoppedError(Exception):

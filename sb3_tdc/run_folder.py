@@ -105,7 +105,7 @@ class RunFolder:
 
     def mark_finished(self, n_timesteps: int) -> None:
         """The last step has been done, and the model saved."""
-        self._finished.write_text(yaml.safe_dump({"n_timesteps": n_timesteps}))
+        _write_text(self._finished, yaml.safe_dump({"n_timesteps": n_timesteps}))
 
     def checkpoints(self) -> dict[int, Path]:
         """:return: the model of every checkpoint, by timestep, oldest first"""
@@ -134,9 +134,9 @@ class RunFolder:
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
         """Keep what the run was made from: hyperparameters, arguments, and the command."""
         folder = self.path / self.env_name
-        (folder / "config.yml").write_text(yaml.safe_dump(config))
-        (folder / "args.yml").write_text(yaml.safe_dump(args))
-        (folder / "command.txt").write_text(shlex.join(sys.orig_argv) + "\n")
+        _write_text(folder / "command.txt", shlex.join(sys.orig_argv) + "\n")
+        _write_text(folder / "config.yml", yaml.safe_dump(config))
+        _write_text(folder / "args.yml", yaml.safe_dump(args))
 
 
 def save(save_as: Callable[[Path], Any], path: Path) -> None:
@@ -181,6 +181,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{path} must be a mapping")
     return content
+
+
+def _write_text(path: Path, text: str) -> None:
+    save(lambda beside: beside.write_text(text), path)
 
 
 def _env_name(env_id: str) -> str:

@@ -65,7 +65,9 @@ def test_a_run_leaves_what_rl_zoo_leaves(tmp_path, capsys):
         "replay_buffer.pkl", *(f"rl_model_{n}_steps.zip" for n in (100, 200, 300)),
         *(f"rl_model_replay_buffer_{n}_steps.pkl" for n in (100, 200, 300)),
     }  # fmt: skip
-    assert {path.name for path in (folder / "Hopper-v4").iterdir()} == {"args.yml", "command.txt", "config.yml"}
+    assert {path.name for path in (folder / "Hopper-v4").iterdir()} == {
+        "args.yml", "command.txt", "config.yml", "finished.yml",
+    }  # fmt: skip
     config = yaml.safe_load((folder / "Hopper-v4" / "config.yml").read_text())
     assert (config["lam"], config["n_timesteps"], config["learning_starts"]) == (0.9, 300, 100)
     assert yaml.safe_load((folder / "Hopper-v4" / "args.yml").read_text())["seed"] == 1
@@ -159,7 +161,8 @@ def test_the_command_to_go_on_is_the_same_experiment(tmp_path, capsys, monkeypat
         return not self.requested
 
     monkeypatch.setattr(StopOnSignal, "_on_step", stop_at_150)
-    assert run_train(tmp_path, "-params", *SMALL[1:], "lam:0.25", "normalize:true", small=[]) == 130
+    params = [*SMALL, "lam:0.25", "normalize:true"]
+    assert run_train(tmp_path, "--checkpoint-freq", -1, small=params) == 130
     (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  python train.py")]
     monkeypatch.undo()
     assert train.main(shlex.split(command)[2:]) == 0
@@ -285,8 +288,9 @@ def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
     assert process.returncode == 130, err
     assert "Traceback" not in err
     model = tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip"
-    left = 1_000_000 - TDC.load(model).num_timesteps
-    assert f"python train.py -n {left} -i {model} --env Hopper-v4 -f {tmp_path} --eval-freq -1" in out
+    steps = TDC.load(model).num_timesteps
+    assert f"Stopped at step {steps:,} of 1,000,000. To go on from step {steps - 2:,}:" in out
+    assert f"python train.py --resume {model.parent}" in out
 
 
 def test_stopping_an_evaluation_that_would_never_end(tmp_path):

@@ -1,5 +1,6 @@
 """The callback that writes checkpoints and restores them."""
 
+import io
 import json
 import os
 import shutil
@@ -182,7 +183,7 @@ class Checkpoints(BaseCallback):
         writers: dict[str, Any] = {
             "state.json": lambda path: path.write_text(json.dumps(content)),
             "arrays.npz": lambda path: np.savez(path, **arrays),  # type: ignore[arg-type]
-            "weights.pt": lambda path: th.save(weights, path),
+            "weights.pt": lambda path: _save_weights(weights, path),
         }
         stats = {file: file.stat() for file in files if file.exists()}
         writers |= {f"file_{i}": self._copier(file) for i, file in enumerate(files) if file in stats}
@@ -237,6 +238,12 @@ class Checkpoints(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+def _save_weights(weights: dict[str, Any], path: Path) -> None:
+    content = io.BytesIO()  # PyTorch's own writer hides what is wrong with a disk in a RuntimeError
+    th.save(weights, content)
+    path.write_bytes(content.getbuffer())
 
 
 def _identity(stat: os.stat_result) -> tuple[int, ...]:

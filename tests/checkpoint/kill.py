@@ -1,8 +1,8 @@
 """
-Kill a training run (SIGKILL) at random instants, resume it each time, and compare the end with a run that was left alone.
+Kill a training run (SIGKILL) at random instants, resume it each time, compare the end with a run that was left alone.
 
-``python -m tests.checkpoint.kill --kills 50 --folder /tmp/kills`` prints where each kill struck and what differs; it goes
-on where it was if it is itself stopped.
+``python -m tests.checkpoint.kill --kills 50 --folder /tmp/kills`` prints where each kill struck and what differs; it
+goes on where it was if it is itself stopped.
 """
 
 import argparse
@@ -44,7 +44,7 @@ _PHASES = {
 
 
 def arguments(folder: Path, steps: int) -> list[str]:
-    """:return: a run in which much happens: an evaluation and several checkpoints a second, a ring that is overwritten"""
+    """:return: a run in which much happens: evaluations and checkpoints every second, a ring that is overwritten"""
     small = ["policy_kwargs:{net_arch: [32, 32], n_quantiles: 8}", "learning_starts:100", "batch_size:32"]
     run = ["--env", "Hopper-v4", "-n", str(steps), "--seed", "1", "-f", str(folder), "--save-freq", "1000"]
     often = ["--eval-freq", "120", "--eval-episodes", "3", "--checkpoint-freq", "60", "--log-interval", "1"]

@@ -5,7 +5,10 @@ import enum
 import functools
 import json
 import random
+import re
+import sys
 import threading
+import types
 
 import gymnasium as gym
 import numpy as np
@@ -182,7 +185,6 @@ def test_functions_go_on_with_what_they_enclose():
         (Point({"a": iter([1])}), "value.x['a'] is a builtins.list_iterator"),
         (Point(open), None),
         (Point(x for x in ()), "value.x is a builtins.generator"),
-        (Point(socket := __import__("socket").socket()), "value.x"),
         (gym.make("CartPole-v1").unwrapped, None),
     ],
     ids=str,
@@ -191,7 +193,7 @@ def test_what_can_hide_a_state_is_refused_by_its_path(value, message):
     if message is None:
         Capture().capture(value, "value")
     else:
-        with pytest.raises(NotCapturedError, match=message.replace("[", r"\[").replace("]", r"\]")):
+        with pytest.raises(NotCapturedError, match=re.escape(message)):
             Capture().capture(value, "value")
 
 
@@ -206,8 +208,6 @@ def test_what_does_not_fit_is_refused(before, there):
 
 def test_a_simulator_behind_a_number_is_not_taken_for_its_state(monkeypatch):
     """As pybullet's client: a Python object whose state is elsewhere."""
-    import types
-
-    monkeypatch.setattr(__import__("sys").modules[__name__], "p", types.ModuleType("pybullet"), raising=False)
+    monkeypatch.setattr(sys.modules[__name__], "p", types.ModuleType("pybullet"), raising=False)
     with pytest.raises(NotCapturedError, match="uses pybullet"):
         Capture().capture(Point(0), "env")

@@ -69,7 +69,7 @@ def test_damage_goes_back_to_the_one_before_and_says_so(store, how, name):
     ):
         assert store.newest().step == 1
     damage(store.folder / "step_000000000001" / "b", how)
-    with pytest.raises(BrokenCheckpointError, match="No checkpoint in .* is intact"):
+    with pytest.raises(BrokenCheckpointError, match=r"No checkpoint in .* is intact"):
         store.newest()
 
 

@@ -1,0 +1,366 @@
+"""``train.py --resume`` and ``Checkpoints``: what a user sees when a run is stopped, damaged, or not what it was."""
+
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from gymnasium.envs.classic_control import PendulumEnv
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_tdc import TDC, interruption, train
+from sb3_tdc.checkpoint import Checkpoints, NotCapturedError, Restorable, callback, state
+from sb3_tdc.progress import ProgressCallback
+from tests.checkpoint import kill
+from tests.checkpoint.runs import Stop, StopAt, digest, files
+
+SMALL = ["-params", "policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
+N = 400
+
+
+def run_train(folder, *args, env="Hopper-v4", n=N, small=SMALL):
+    argv = ["--env", env, "-n", n, "--seed", 1, "-f", folder, "--eval-freq", 150, "--eval-episodes", 2]
+    return train.main([str(a) for a in [*argv, "--checkpoint-freq", 40, "--device", "cpu", *small, *args]])
+
+
+def resume(folder, *args):
+    return train.main(["--resume", str(folder), *map(str, args)])
+
+
+def outcome(folder):
+    name = next(folder.glob("*.zip")).stem if not (folder / "Hopper-v4.zip").exists() else "Hopper-v4"
+    model = TDC.load(folder / f"{name}.zip", device="cpu")
+    return {"weights": digest(model.policy.state_dict()), "steps": model.num_timesteps, **files(folder)}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    assert run_train(folder) == 0
+    return outcome(folder / "tdc" / "Hopper-v4_1")
+
+
+@pytest.fixture
+def stop_at(monkeypatch):
+    """A signal in the middle of a step."""
+
+    def set_up(step):
+        original = ProgressCallback._on_step
+
+        def on_step(self):
+            if self.num_timesteps == step:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return original(self)
+
+        monkeypatch.setattr(ProgressCallback, "_on_step", on_step)
+
+    return set_up
+
+
+@pytest.fixture
+def stopped(tmp_path, stop_at, monkeypatch):
+    """The folder of a run that was stopped at step 270, which the checkpoint of step 271 was made for."""
+    stop_at(270)
+    assert run_train(tmp_path) == 130
+    monkeypatch.undo()
+    return tmp_path / "tdc" / "Hopper-v4_1"
+
+
+def test_a_signal_loses_nothing(stopped, whole, capsys):
+    screen = capsys.readouterr().out
+    assert "To go on from step 270:" in screen
+    assert f"python train.py --resume {stopped}" in screen
+    assert resume(stopped) == 0
+    screen = capsys.readouterr().out
+    assert "Resuming tdc on Hopper-v4, seed 1" in screen
+    assert "Going on from step 270" in screen
+    assert outcome(stopped) == whole
+    assert not (stopped / "checkpoints").exists()  # of no use any more
+
+
+def test_a_finished_run_is_left_alone(tmp_path, capsys):
+    assert run_train(tmp_path, n=150) == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    capsys.readouterr()
+    assert resume(folder) == 0
+    assert capsys.readouterr().out == f"{folder} is finished: there is nothing to resume\n"
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_again(stopped, whole):
+    shutil.rmtree(stopped / "checkpoints")
+    assert resume(stopped) == 0
+    assert outcome(stopped) == whole
+
+
+def test_a_damaged_checkpoint_costs_only_the_way_from_the_one_before(stopped, whole):
+    newest = max((stopped / "checkpoints").glob("step_*"))
+    (newest / "weights.pt").write_bytes((newest / "weights.pt").read_bytes()[:-1])
+    with pytest.warns(RuntimeWarning, match=r"weights.pt is damaged; going back to the checkpoint of step 240"):
+        assert resume(stopped) == 0
+    assert outcome(stopped) == whole
+
+
+def fails(call, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        call()
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return error
+
+
+def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
+    for args, message in (
+        (["--seed", "3"], f"--seed 3 contradicts the run in {stopped}: --seed 1"),
+        (["--algo", "sac"], "--algo sac contradicts the run in"),
+        (["-n", "500"], "--n-timesteps 500 contradicts the run in"),
+        (["-params", "lam:0.5"], "--hyperparams {'lam': 0.5} contradicts the run in"),
+    ):
+        assert message in fails(lambda args=args: resume(stopped, *args), capsys)
+    assert "is not the folder of a run" in fails(lambda: resume(tmp_path), capsys)
+    for manifest in (stopped / "checkpoints").glob("*/manifest"):
+        manifest.unlink()
+    assert "No checkpoint in" in fails(lambda: resume(stopped), capsys)
+    assert len(list((stopped / "checkpoints").glob("step_*"))) == 2  # nothing was thrown away
+    args = yaml.safe_load((stopped / "Hopper-v4" / "args.yml").read_text())
+    (stopped / "Hopper-v4" / "args.yml").write_text(yaml.safe_dump({**args, "checkpoint_freq": -1}))
+    assert "has no checkpoints" in fails(lambda: resume(stopped), capsys)
+    (stopped / "Hopper-v4" / "args.yml").unlink()
+    assert "was stopped before its run began" in fails(lambda: resume(stopped), capsys)
+
+
+def test_the_same_arguments_are_no_contradiction(stopped, whole):
+    assert resume(stopped, "--env", "Hopper-v4", "--seed", "1", "--verbose", "0") == 0
+    assert outcome(stopped) == whole
+
+
+def test_a_full_disk_stops_nothing_but_the_checkpoint(tmp_path, whole, monkeypatch, stop_at):
+    """From step 100 to 250 nothing can be synced: no checkpoint is written, and the one before stays."""
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    write = Checkpoints._write
+
+    def full(self, step):
+        with monkeypatch.context() as patch:
+            if 100 <= step <= 250:
+                patch.setattr(os, "fsync", no_space)
+            write(self, step)
+
+    def no_space(descriptor):
+        assert list((folder / "checkpoints").glob("step_*"))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Checkpoints, "_write", full)
+    stop_at(300)
+    with pytest.warns(
+        RuntimeWarning, match=r"could not be written .*No space left.* Training goes on; that of step 80"
+    ):
+        assert run_train(tmp_path) == 130
+    monkeypatch.undo()
+    assert resume(folder) == 0
+    assert outcome(folder) == whole
+
+
+def test_a_full_disk_does_not_stop_an_evaluation(tmp_path, monkeypatch):
+    def full(self, path, *args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    save = TDC.save
+    monkeypatch.setattr(TDC, "save", lambda self, path: (full if "best" in str(path) else save)(self, path))
+    with pytest.warns(UserWarning, match=r"best model of step 150 was not saved.*No space left"):
+        assert run_train(tmp_path, n=200) == 0
+
+
+def test_a_signal_does_not_wait_for_the_end_of_an_endless_episode(tmp_path, capsys, monkeypatch, stop_at):
+    gym.register("Endless-v1", PendulumEnv)
+    monkeypatch.setattr(interruption, "_PATIENCE_SECONDS", 0.3)
+    stop_at(200)
+    start = time.monotonic()
+    episodes = [*SMALL, "train_freq:[1, episode]"]
+    assert run_train(tmp_path, "--eval-freq", -1, env="Endless-v1", n=1_000_000, small=episodes) == 130
+    assert time.monotonic() - start < 60
+    assert "To go on from step 0:" in capsys.readouterr().out
+
+
+def test_several_kills(tmp_path):
+    """Fewer than ``python -m tests.checkpoint.kill`` makes."""
+    assert kill.main(["--kills", "3", "--steps", "2000", "--folder", str(tmp_path)]) == 0
+
+
+# ---------------------------------------------------------------- in Python
+
+
+def make_model(env="Pendulum-v1", algorithm=TDC, seed=1, **kwargs):
+    defaults = {"learning_starts": 20, "batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8, 8]}}
+    policy = "MultiInputPolicy" if kwargs.pop("multi_input", False) else "MlpPolicy"
+    return algorithm(policy, env, seed=seed, device="cpu", **{**defaults, **kwargs})
+
+
+def learn(model, folder, stop_at=None, steps=150, **kwargs):
+    checkpoints = Checkpoints(folder, freq=20, verbose=0, **kwargs)
+    try:
+        restored = checkpoints.restore(model)
+        model.learn(steps, callback=[checkpoints, StopAt(stop_at)])
+    except Stop:
+        pass
+    finally:
+        checkpoints.store.close()
+    return restored
+
+
+def test_a_checkpoint_of_another_run_is_refused(tmp_path):
+    learn(make_model(), tmp_path, stop_at=70)
+    for model, difference in (
+        (make_model(algorithm=SAC), "the algorithm was sb3_tdc.tdc.tdc.TDC, and is stable_baselines3.sac.sac.SAC"),
+        (make_model("MountainCarContinuous-v0"), "the environment was Pendulum-v1, and is MountainCarContinuous-v0"),
+        (make_model(policy_kwargs={"net_arch": [4]}), "the network is another"),
+        (make_model(buffer_size=400), "the size of the replay buffer was 500, and is 400"),
+        (make_model(make_vec_env("Pendulum-v1", 2)), "the number of environments was 1, and is 2"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(difference)):
+            learn(model, tmp_path)
+    model, checkpoints = make_model(), Checkpoints(tmp_path)
+    with pytest.raises(ValueError, match="has checkpoints of a run already: call restore"):
+        model.learn(10, callback=checkpoints)
+    checkpoints.store.close()
+
+
+def test_other_callbacks_are_noticed(tmp_path):
+    learn(make_model(), tmp_path, stop_at=70)
+    model, checkpoints = make_model(), Checkpoints(tmp_path)
+    checkpoints.restore(model)
+    with pytest.raises(ValueError, match="callbacks"):
+        model.learn(100, callback=checkpoints)
+    checkpoints.store.close()
+
+
+def test_another_platform_is_named(tmp_path, monkeypatch):
+    learn(make_model(), tmp_path, stop_at=70)
+    here = state.describe_platform(make_model())
+    monkeypatch.setattr(state, "describe_platform", lambda model: {**here, "torch": "9.9"})
+    with pytest.warns(RuntimeWarning, match=f"torch was {re.escape(here['torch'])}, is 9.9$"):
+        learn(make_model(), tmp_path)
+
+
+class Locked(PendulumEnv):
+    """Python cannot see into a lock, so this cannot be captured."""
+
+    def __init__(self):
+        super().__init__()
+        self.lock = threading.Lock()
+
+
+gym.register("Locked-v0", Locked, max_episode_steps=1000)
+
+
+@pytest.mark.parametrize("vec_env", [None, SubprocVecEnv])
+@pytest.mark.parametrize("kwargs", [{}, {"n_steps": 3}], ids=str)
+def test_an_environment_that_cannot_be_captured_starts_its_episode_again(tmp_path, vec_env, kwargs):
+    def make():
+        if vec_env is None:
+            return make_model("Locked-v0", **kwargs)
+        return make_model(make_vec_env(Locked, 2, vec_env_cls=vec_env, wrapper_class=Restorable), **kwargs)
+
+    learn(make(), tmp_path, stop_at=70)
+    model = make()
+    seen = {}
+    original = callback.Checkpoints._restore
+
+    def look(self):
+        original(self)
+        seen.update(pos=model.replay_buffer.pos, updates=model._n_updates)
+        seen["last"] = model.replay_buffer.dones[seen["pos"] - 1].copy(), model.replay_buffer.timeouts[seen["pos"] - 1]
+        seen["generators"] = [env.np_random.bit_generator.state for env in getattr(model.env, "envs", [])]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(callback.Checkpoints, "_restore", look)
+        with pytest.warns(RuntimeWarning, match=r"with new episodes.*lock is a _thread.lock"):
+            assert learn(model, tmp_path) == 60
+    assert seen["pos"] == 60 // model.n_envs
+    assert seen["updates"] > 0
+    assert all((part == 1).all() for part in seen["last"])  # cut off there, as by a time limit
+    assert model.num_timesteps == 150
+    # The generator goes on: the second episode is not the first again
+    assert all(s != gym.make("Locked-v0").reset(seed=1) for s in seen["generators"])
+
+
+def test_processes_without_the_wrapper_are_told_about_it(tmp_path):
+    def make():
+        return make_model(make_vec_env("Pendulum-v1", 2, vec_env_cls=SubprocVecEnv))
+
+    learn(make(), tmp_path, stop_at=70)
+    with pytest.warns(RuntimeWarning, match=r"wrap its environments in sb3_tdc.checkpoint.Restorable"):
+        learn(make(), tmp_path)
+
+
+def test_an_algorithm_that_cannot_be_captured_is_named_before_it_trains(tmp_path):
+    model = make_model()
+    model.lock = threading.Lock()
+    with pytest.raises(NotCapturedError, match=r"model\.lock is a _thread\.lock"):
+        learn(model, tmp_path)
+    assert model.num_timesteps == 0
+
+
+def test_arguments_out_of_range(tmp_path):
+    for name in ("freq", "keep"):
+        with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+            Checkpoints(tmp_path, **{name: 0})
+
+
+def test_nothing_is_pickled(tmp_path):
+    """Every file is JSON, arrays without objects, or weights; a pickle that was put in their place is not executed."""
+    learn(make_model(), tmp_path, stop_at=70)
+    kinds = {path.suffix for path in tmp_path.rglob("*") if path.is_file()} - {""}
+    assert kinds == {".json", ".npz", ".pt"}
+    for path in tmp_path.rglob("*.npz"):
+        with np.load(path, allow_pickle=False) as arrays:
+            assert all(arrays[name].dtype != object for name in arrays.files)
+    newest = max(tmp_path.glob("step_*"))
+    json.loads((newest / "state.json").read_text())
+    th.load(newest / "weights.pt", weights_only=True)
+
+    class Poison:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "executed",)
+
+    th.save({"state_dicts": Poison()}, newest / "weights.pt")
+    np.savez(newest / "arrays.npz", **{"0": np.array([Poison()], dtype=object)})
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setattr("sb3_tdc.checkpoint.store._sha256", lambda path: _digest_of(newest, path))
+        with pytest.raises(Exception, match=r"[Ww]eights|pickle"):
+            learn(make_model(), tmp_path)
+    assert not (tmp_path / "executed").exists()
+
+
+def _digest_of(folder, path):
+    """As if the manifest had been forged too."""
+    manifest = json.loads((folder / "manifest").read_text().splitlines()[0])
+    known = {**manifest["files"], **manifest["shared"]}
+    return known.get(path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def test_what_is_written_is_what_was_added(tmp_path):
+    """Bytes in proportion to the transitions since the last checkpoint; the ring's old parts go."""
+    model = make_model(buffer_size=200)
+    learn(model, tmp_path, steps=1000)
+    segments = sorted((tmp_path / "replay").iterdir())
+    sizes = [path.stat().st_size for path in segments]
+    assert max(sizes) < 1.1 * min(sizes)
+    assert 10 <= len(segments) <= 12  # 200 transitions, 20 a checkpoint, for the two newest
+    assert len(list(tmp_path.glob("step_*"))) == 2
