@@ -433,13 +433,20 @@ def _restore_enum(context: Restore, content: Any, existing: Any, path: str) -> A
     return type(existing)[member]
 
 
+_MADE_AT_RUN_TIME = 1 << 9  # Py_TPFLAGS_HEAPTYPE: by a class statement, or by C that imitates one
+
+
 def _is_python_object(value: Any) -> bool:
     """Whether all of its state is in its attributes: every class is Python's, and nothing is hidden behind it."""
-    kind = type(value)
-    slots = sum(isinstance(v, types.MemberDescriptorType) for c in kind.__mro__ for v in vars(c).values())
-    pure = all(isinstance(vars(c).get("__new__"), staticmethod | None) for c in kind.__mro__[:-1])
+    classes = type(value).__mro__[:-1]
+    pure = all(
+        kind.__flags__ & _MADE_AT_RUN_TIME and isinstance(vars(kind).get("__new__"), staticmethod | None)
+        for kind in classes
+    )
+    slots = sum(_is_slot(v) for kind in classes for v in vars(kind).values())
+    has_attributes = hasattr(value, "__dict__") or any("__slots__" in vars(kind) for kind in classes)
     # The head of an object, its __dict__, its weak references, its slots: native objects are larger
-    return pure and kind.__basicsize__ <= object.__basicsize__ + 8 * (2 + slots)
+    return pure and has_attributes and type(value).__basicsize__ <= object.__basicsize__ + 8 * (2 + slots)
 
 
 def _uses_native_package(kind: type) -> str | None:

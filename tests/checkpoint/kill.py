@@ -106,8 +106,8 @@ def main(argv: list[str] | None = None) -> int:
     alone, killed = (args.folder / name / "tdc" / "Hopper-v4_1" for name in ("alone", "killed"))
     if not (alone / "Hopper-v4" / "finished.yml").exists():
         assert not alone.exists(), f"{args.folder} holds a run that was not finished: take another folder"
-        process = start(arguments(args.folder / "alone", args.steps), args.folder / "alone")
-        assert process.wait() == 0, "see alone.log"
+        process = start(arguments(args.folder / "alone", args.steps), args.folder / "alone_stack")
+        assert process.wait() == 0, "see alone_stack.log"
 
     record = args.folder / "kills.json"
     struck: list[str] = json.loads(record.read_text()) if record.exists() else []
@@ -127,8 +127,8 @@ def main(argv: list[str] | None = None) -> int:
         struck.append(where)
         record.write_text(json.dumps(struck))
         print(f"Kill {len(struck)}: {where}", flush=True)
-    process = start(["--resume", str(killed)], args.folder / "last")
-    assert process.wait() == 0, "see last.log"
+    process = start(["--resume", str(killed)], args.folder / "last_stack")
+    assert process.wait() == 0, "see last_stack.log"
 
     expected, found = outcome(alone), outcome(killed)
     differing = [name for name in expected | found if expected.get(name) != found.get(name)]
