@@ -109,7 +109,7 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
     except OSError as error:
         raise ValueError(f"{folder.path} was stopped before its run began: start it anew ({error})") from error
     for name, value in _plain(argparse.Namespace(**given)).items():
-        if name in stored and name not in _OF_THE_PROCESS and value != stored[name]:
+        if name not in (*_OF_THE_PROCESS, "resume") and value != stored.get(name, value):
             flag = f"--{name.replace('_', '-')}"
             raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {stored[name]}")
     resumed = {**stored, **{name: value for name, value in given.items() if name in (*_OF_THE_PROCESS, "resume")}}

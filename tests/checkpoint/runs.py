@@ -28,7 +28,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_tdc import TDC
 from sb3_tdc.checkpoint import Checkpoints, Restorable
 
-STEPS = 400
+STEPS = 300
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
 # On the wall clock
 _TIMES = ("t", "time/fps", "time/time_elapsed")
@@ -74,7 +74,7 @@ class Case:
     vec_env: type = DummyVecEnv
     wrap: Callable | None = None
     wrapper_class: Any = None
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: dict[str, Any] = field(default_factory=lambda: {"max_episode_steps": 90})
     policy: str = "MlpPolicy"
     kwargs: dict[str, Any] = field(default_factory=dict)
     steps: int = STEPS
@@ -82,7 +82,8 @@ class Case:
 
 def _make_case(env: str, n_envs: int, vec_env: type, stochastic: bool) -> Case:
     wrapper_class = Restorable if vec_env is SubprocVecEnv else None
-    return Case(env, TDC, n_envs, vec_env, wrapper_class=wrapper_class, kwargs={"stochastic_actor": stochastic})
+    kwargs = {"stochastic_actor": stochastic}
+    return Case(env, TDC, n_envs, vec_env, wrapper_class=wrapper_class, kwargs=kwargs)
 
 
 # {HalfCheetah, Hopper, Walker2d, Ant, Humanoid} × {one, two; in this process, in their own} × both heads
@@ -109,9 +110,12 @@ OTHERS = {
             "buffer_size": 130,
         },
     ),
-    "HER": Case(Reach, policy="MultiInputPolicy", n_envs=2, kwargs={**_HER, "buffer_size": 300}),
+    "HER": Case(Reach, policy="MultiInputPolicy", n_envs=2, env_kwargs={}, kwargs={**_HER, "buffer_size": 300}),
     "HER with infos": Case(
-        Reach, policy="MultiInputPolicy", kwargs={**_HER, "replay_buffer_kwargs": {"copy_info_dict": True}}
+        Reach,
+        policy="MultiInputPolicy",
+        env_kwargs={},
+        kwargs={**_HER, "replay_buffer_kwargs": {"copy_info_dict": True}},
     ),
     "schedules, train_freq": Case(
         kwargs={
@@ -231,7 +235,7 @@ def make_callbacks(case: Case, folder: Path, stop_at: int | None) -> list[BaseCa
     evaluation = EvalCallback(
         eval_env,
         n_eval_episodes=1,
-        eval_freq=max(130 // case.n_envs, 1),
+        eval_freq=max(110 // case.n_envs, 1),
         log_path=str(folder),
         best_model_save_path=str(folder),
         verbose=0,
@@ -316,7 +320,7 @@ def _member(path: Path, name: str) -> Any:
 
 def stopping_step(name: str, steps: int) -> int:
     """:return: a step that looks random, after the first checkpoint with a weight update and before the last"""
-    return 100 + int(hashlib.sha256(name.encode()).hexdigest(), 16) % (steps - 120)
+    return 90 + int(hashlib.sha256(name.encode()).hexdigest(), 16) % (steps - 100)
 
 
 def main(mode: str, folder: Path, names: list[str]) -> None:
