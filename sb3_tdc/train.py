@@ -15,7 +15,7 @@ import yaml
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments
-from sb3_tdc.checkpoint import DEFAULT_FREQ
+from sb3_tdc.checkpoint import DEFAULT_FREQ, NotRestoredError
 from sb3_tdc.experiment import ALGORITHMS, Experiment, Outcome, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.run_folder import RunFolder
@@ -205,7 +205,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{verb} {args.algo} on {args.env}, seed {args.seed}, in {folder.path}", flush=True)
     try:
         outcome = train(experiment)
-    except SetupError as error:
+    except (SetupError, NotRestoredError) as error:
         parser.fail(error)
     except NonFiniteError as error:
         print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)

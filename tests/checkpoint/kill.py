@@ -97,8 +97,9 @@ def outcome(folder: Path) -> dict[str, Any]:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--steps", type=int, default=6_000)
+    parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--longest", type=float, default=2.0, help="seconds of training before a kill, at most")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
     args.folder.mkdir(parents=True, exist_ok=True)
@@ -120,7 +121,7 @@ def main(argv: list[str] | None = None) -> int:
             ["--resume", str(killed)] if resumable else arguments(args.folder / "killed", args.steps), stack
         )
         _wait(process, stack, until_it_runs=draw.random() < 0.9)
-        time.sleep(draw.uniform(0, 2))
+        time.sleep(draw.uniform(0, args.longest))
         where = kill(process, stack)
         if where == "ended":
             raise SystemExit(f"The run ended after {len(struck)} kills: more --steps")

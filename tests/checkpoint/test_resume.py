@@ -199,7 +199,7 @@ def test_a_signal_does_not_wait_for_the_end_of_an_endless_episode(tmp_path, caps
 
 def test_several_kills(tmp_path):
     """Fewer than ``python -m tests.checkpoint.kill`` makes."""
-    assert kill.main(["--kills", "3", "--steps", "2000", "--folder", str(tmp_path)]) == 0
+    assert kill.main(["--kills", "3", "--steps", "3000", "--longest", "0.4", "--folder", str(tmp_path)]) == 0
 
 
 # ---------------------------------------------------------------- in Python
