@@ -202,7 +202,8 @@ def play_episodes(model: TDC, env: VecEnv, n_episodes: int, limit: int | None = 
     :param env: whose rewards are those that the critics were trained on
     :param limit: leave out the steps after so many; the rewards there still count
     """
-    recording, episodes = Recording(model), []
+    recording = Recording(model)
+    episodes: list[Episode] = []
     observation: Any = env.reset()
     while len(episodes) < n_episodes:
         action, _ = model.predict(observation, deterministic=True)
