@@ -6,6 +6,7 @@ ratio does not follow. Peers: ``pip install "sb3-tdc[bench]"``; one that is miss
 """
 
 import argparse
+import copy
 import importlib
 import json
 import os
@@ -176,7 +177,7 @@ def gradient_error(exact: Any, other: Any) -> dict[str, float]:
     """:return: ‖g' − g‖ / ‖g‖ of the gradients of one update with the same weights, batch and random numbers"""
     import torch as th
 
-    other.set_parameters(exact.get_parameters())
+    other.set_parameters(copy.deepcopy(exact.get_parameters()))  # an optimizer takes the tensors themselves
     data, gradients = exact.replay_buffer.sample(256), []
     for model in (exact, other):
         th.manual_seed(0)
