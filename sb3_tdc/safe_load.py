@@ -449,6 +449,7 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     "target_entropy": _or_none(_text_or_number),
     "seed": _or_none(_integer(0)),
     "fused": _or_none(_boolean),
+    "fused_kwargs": _arguments,
     "verbose": _integer(0, 2),
     "n_envs": _integer(1, MAX_ENVS),
     **dict.fromkeys(("gradient_steps", "sde_sample_freq"), _integer(-1)),
