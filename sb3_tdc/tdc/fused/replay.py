@@ -26,7 +26,8 @@ class PackedReplay:
         self.indices = th.empty(batch_size, dtype=th.long, device=device)
         observations, actions, next_observations, rewards, dones = self.batch.split(self.widths, dim=1)
         self.samples = ReplayBufferSamples(observations, actions, next_observations, dones, rewards)
-        self.pos, self.steps = 0, -1
+        self.pos = 0
+        self.steps: int | None = None  # when the rows were copied last
 
     @staticmethod
     def applies(buffer: ReplayBuffer) -> bool:
@@ -50,7 +51,7 @@ class PackedReplay:
     def _copy_new_rows(self, steps: int) -> None:
         buffer = self.buffer
         size = buffer.buffer_size
-        if steps - self.steps != (buffer.pos - self.pos) % size:  # the first time, or more than the buffer holds
+        if self.steps is None or steps - self.steps != (buffer.pos - self.pos) % size:  # or more than it holds
             self._copy_rows(slice(0, size if buffer.full else buffer.pos))
         elif buffer.pos < self.pos:
             self._copy_rows(slice(self.pos, size))
