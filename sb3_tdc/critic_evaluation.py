@@ -11,8 +11,9 @@ from sb3_tdc.tdc import TDC
 
 # Steps of evaluations that the critics are asked about: neighbours tell the same
 _EVERY = 10
-# A figure is drawn when so many times what the last one cost has passed
-_PATIENCE = 300
+# A figure is drawn while all of this stays below this share of the time since training began
+_SHARE = 0.01
+_SECONDS_OF_FIRST_FIGURE = 2.0
 
 
 class CriticEvaluation(StoppableEvaluation):
@@ -20,8 +21,8 @@ class CriticEvaluation(StoppableEvaluation):
     An evaluation that also holds TDC's critics against the returns of its episodes; of other algorithms, just that.
 
     Logs ``eval/overestimation``, ``eval/calibration_error``, the seconds all this has taken since training began as
-    ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, now and then. Plays no step more, and
-    draws no random number. Where a time limit ends episodes before the discount has
+    ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as fits in one percent of the
+    time. Plays no step more, and draws no random number. Where a time limit ends episodes before the discount has
     faded, there is nothing to log.
     """
 
@@ -29,8 +30,9 @@ class CriticEvaluation(StoppableEvaluation):
         super()._init_callback()
         self.recordings: dict[int, Recording] = {}
         self.episodes: list[Episode] = []
-        self.next_figure = 0.0
         self.elapsed = 0.0
+        self.seconds_per_figure = _SECONDS_OF_FIRST_FIGURE
+        self.start = time.perf_counter()
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         super()._log_success_callback(locals_, globals_)
@@ -59,12 +61,11 @@ class CriticEvaluation(StoppableEvaluation):
     def _draw(self, episodes: list[Episode]) -> None:
         start = time.perf_counter()
         has_tensorboard = any(isinstance(writer, TensorBoardOutputFormat) for writer in self.logger.output_formats)
-        if not has_tensorboard or start < self.next_figure:
+        if not has_tensorboard or self.elapsed + self.seconds_per_figure > _SHARE * (start - self.start):
             return
         try:
             picture = render(make_figure(episodes, f"Evaluation at step {self.num_timesteps:,}"))
         except ImportError:  # the numbers are enough
             return
         self.logger.record("eval/critics", Image(picture, "HWC"), exclude=("stdout", "log", "json", "csv"))
-        now = time.perf_counter()
-        self.next_figure = now + _PATIENCE * (now - start)
+        self.seconds_per_figure = time.perf_counter() - start
