@@ -195,7 +195,7 @@ def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monke
     eval_env.training = eval_env.norm_reward = False
     model = make_model(env, gradient_steps=0)
     model.learn(30, callback=critic_evaluation.CriticEvaluation(
-        eval_env, StopOnSignal(), n_eval_episodes=2, eval_freq=30, verbose=0
+        eval_env, StopOnSignal(), n_eval_episodes=2, eval_freq=30, verbose=0, warn=False
     ))  # fmt: skip
     (episodes,) = seen
     assert len(episodes) == 2
