@@ -120,7 +120,7 @@ def main(argv: list[str] | None = None) -> int:
         process = start(
             ["--resume", str(killed)] if resumable else arguments(args.folder / "killed", args.steps), stack
         )
-        _wait(process, stack, until_it_runs=draw.random() < 0.9)
+        _wait(process, stack, until_it_trains=draw.random() < 0.9)
         time.sleep(draw.uniform(0, args.longest))
         where = kill(process, stack)
         if where == "ended":
@@ -139,10 +139,12 @@ def main(argv: list[str] | None = None) -> int:
     return int(bool(differing))
 
 
-def _wait(process: subprocess.Popen, stack: Path, until_it_runs: bool) -> None:
-    """Until it can tell where it is, which is before its imports, or until it says that it begins."""
+def _wait(process: subprocess.Popen, stack: Path, until_it_trains: bool) -> None:
+    """Until it can tell where it is, which is before its imports, or until it says that it goes on."""
     log = stack.with_suffix(".log")
-    while process.poll() is None and not (stack.exists() and (not until_it_runs or " tdc on " in log.read_text())):
+    while process.poll() is None and not stack.exists():
+        time.sleep(0.005)
+    while until_it_trains and process.poll() is None and not re.search("Going on from|eval ", log.read_text()):
         time.sleep(0.005)
 
 
