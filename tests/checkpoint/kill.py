@@ -10,6 +10,7 @@ import collections
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
