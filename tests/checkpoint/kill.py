@@ -11,6 +11,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -117,10 +118,11 @@ def main(argv: list[str] | None = None) -> int:
     while len(struck) < args.kills:
         stack = args.folder / f"kill_{len(struck)}"
         stack.unlink(missing_ok=True)
-        resumable = (killed / "Hopper-v4" / "args.yml").exists()
-        process = start(
-            ["--resume", str(killed)] if resumable else arguments(args.folder / "killed", args.steps), stack
-        )
+        command = ["--resume", str(killed)]
+        if not (killed / "Hopper-v4" / "args.yml").exists():  # it had not begun
+            shutil.rmtree(args.folder / "killed", ignore_errors=True)
+            command = arguments(args.folder / "killed", args.steps)
+        process = start(command, stack)
         _wait(process, stack, until_it_trains=draw.random() < 0.9)
         time.sleep(draw.uniform(0, args.longest))
         where = kill(process, stack)

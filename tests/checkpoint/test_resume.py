@@ -73,15 +73,20 @@ def stop_at(monkeypatch):
 
 @pytest.fixture
 def stopped(tmp_path, stop_at, monkeypatch):
-    """The folder of a run that was stopped at step 270, which the checkpoint of step 271 was made for."""
+    """The folder of a run that was stopped at step 270."""
     stop_at(270)
     assert run_train(tmp_path) == 130
     monkeypatch.undo()
     return tmp_path / "tdc" / "Hopper-v4_1"
 
 
-def test_a_signal_loses_nothing(stopped, whole, capsys):
+def test_a_signal_loses_nothing(tmp_path, stop_at, monkeypatch, whole, capsys):
+    stop_at(270)
+    assert run_train(tmp_path) == 130
+    monkeypatch.undo()
+    stopped = tmp_path / "tdc" / "Hopper-v4_1"
     screen = capsys.readouterr().out
+    assert "Stopped at step 271 of 400." in screen  # the step after, which is done again
     assert "To go on from step 270:" in screen
     assert f"python train.py --resume {stopped}" in screen
     assert resume(stopped) == 0
@@ -268,8 +273,7 @@ class Locked(PendulumEnv):
 gym.register("Locked-v0", Locked, max_episode_steps=1000)
 
 
-@pytest.mark.parametrize("vec_env", [None, SubprocVecEnv])
-@pytest.mark.parametrize("kwargs", [{}, {"n_steps": 3}], ids=str)
+@pytest.mark.parametrize(("vec_env", "kwargs"), [(None, {}), (None, {"n_steps": 3}), (SubprocVecEnv, {})], ids=str)
 def test_an_environment_that_cannot_be_captured_starts_its_episode_again(tmp_path, vec_env, kwargs):
     def make():
         if vec_env is None:
