@@ -64,7 +64,7 @@ class Run:
 
     def setting(self, key: str) -> Any:
         """:return: a hyperparameter, or what is taken where none is given"""
-        return self.settings.get(key, _defaults(self.algo).get(key))
+        return self.settings.get(key, default_settings(self.algo).get(key))
 
     @property
     def n_timesteps(self) -> int:
@@ -248,13 +248,13 @@ def _label(run: Run, representatives: Sequence[Run]) -> str:
 
 def _identity(run: Run, without: str | None = None) -> str:
     """Everything but the seed (and one setting); what is said and what is left to a default are the same."""
-    settings = {key: run.setting(key) for key in {**_defaults(run.algo), **run.settings} if key != without}
+    settings = {key: run.setting(key) for key in {**default_settings(run.algo), **run.settings} if key != without}
     return _canonical([run.algo, run.env_id, settings])
 
 
 @cache
-def _defaults(algo: str) -> dict[str, Any]:
-    """Of the algorithm's constructor, and of ``train.py``."""
+def default_settings(algo: str) -> dict[str, Any]:
+    """What is taken where nothing is said: by the constructor of the algorithm, and by ``train.py``."""
     parameters = inspect.signature(ALGORITHMS[algo]).parameters.values() if algo in ALGORITHMS else ()
     return {**{p.name: p.default for p in parameters if p.default is not p.empty}, **_ARGUMENTS}
 
@@ -270,6 +270,11 @@ def _canonical(value: Any) -> str:
         return float(item) if isinstance(item, int) and not isinstance(item, bool) else item
 
     return json.dumps(same(value), sort_keys=True, default=str)
+
+
+def same_settings(one: Any, other: Any) -> bool:
+    """Whether two settings say the same: 1 and 1.0 do."""
+    return _canonical(one) == _canonical(other)
 
 
 def _sortable(value: Any) -> tuple[bool, Any]:

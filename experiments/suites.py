@@ -9,6 +9,8 @@ from experiments.results import Run
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
 PYBULLET = ("HalfCheetahBulletEnv-v0", "HopperBulletEnv-v0", "AntBulletEnv-v0", "HumanoidBulletEnv-v0")
 ISAAC = ("Isaac-Repose-Cube-Allegro-v0", "Isaac-Franka-Cabinet-Direct-v0")
+# What registers an environment that gymnasium does not bring
+PACKAGES = dict.fromkeys(PYBULLET, "pybullet_envs_gymnasium")
 
 
 @dataclass(frozen=True)

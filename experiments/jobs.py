@@ -1,0 +1,248 @@
+"""
+One run of ``train.py`` with a place of its own, in a process of its own: what is run by the matrix and by the search.
+
+``python -m experiments.jobs ARGUMENTS`` is ``train.py`` for such a process: it dies with the one that started it.
+"""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from experiments.results import Run, same_settings
+from sb3_tdc import train
+from sb3_tdc.checkpoint import DEFAULT_FREQ
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.run_folder import RunFolder
+
+ROOT = Path(__file__).resolve().parents[1]
+# How often a process is looked at
+POLL_SECONDS = 0.2
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    :param settings: hyperparameters over those of ``hyperparams/``
+    :param logs: the log folder of this run; it may hold others of other algorithms and environments
+    :param packages: to import, that register the environment
+    """
+
+    algo: str
+    env_id: str
+    seed: int
+    n_timesteps: int
+    logs: Path
+    settings: dict[str, Any] = field(default_factory=dict)
+    packages: tuple[str, ...] = ()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """All hyperparameters; the warm-up is that of ``hyperparams/``, but at most a tenth of the run."""
+        entry, _ = read_entry(hyperparams_file(self.algo), self.env_id)
+        config = {**entry, **self.settings, "n_timesteps": self.n_timesteps}
+        if "learning_starts" in entry and "learning_starts" not in self.settings:
+            config["learning_starts"] = min(entry["learning_starts"], self.n_timesteps // 10)
+        return config
+
+    @property
+    def arguments(self) -> list[str]:
+        """Of ``train.py``."""
+        entry, _ = read_entry(hyperparams_file(self.algo), self.env_id)
+        params = {k: v for k, v in self.config.items() if k != "n_timesteps" and (k not in entry or entry[k] != v)}
+        checkpoint_freq = min(DEFAULT_FREQ, max(self.n_timesteps // 10, 1))
+        return [
+            *("--algo", self.algo, "--env", self.env_id, "-n", str(self.n_timesteps), "--seed", str(self.seed)),
+            *("-f", str(self.logs), "--eval-freq", str(eval_freq(self.n_timesteps))),
+            *("--checkpoint-freq", str(checkpoint_freq), "--num-threads", "1", "--device", "cpu", "--no-progress"),
+            *(["--gym-packages", *self.packages] if self.packages else []),
+            *(["-params", *(f"{key}:{_to_yaml(value)}" for key, value in params.items())] if params else []),
+        ]
+
+    @property
+    def log(self) -> Path:
+        """What the run prints."""
+        return self.logs / self.algo / f"{self._env_name}.log"
+
+    @property
+    def run_folder(self) -> RunFolder | None:
+        """
+        None if the run has not begun.
+
+        :raises ValueError: if another run is in its place
+        """
+        begun = (self.logs / self.algo).glob(f"{self._env_name}_*/{self._env_name}/args.yml")
+        newest = max(begun, key=lambda path: path.stat().st_mtime, default=None)
+        if newest is None:
+            return None
+        folder = RunFolder.open(newest.parents[1])
+        here = {**folder.config, "seed": folder.args.get("seed"), "eval_freq": folder.args.get("eval_freq")}
+        wanted = {**self.config, "seed": self.seed, "eval_freq": eval_freq(self.n_timesteps)}
+        differing = [k for k in {**here, **wanted} if not same_settings(here.get(k), wanted.get(k))]
+        if differing:
+            what = ", ".join(f"{key} {here.get(key)} instead of {wanted.get(key)}" for key in differing)
+            raise ValueError(f"{folder.path} is another run ({what}): move it away, or choose another folder")
+        return folder
+
+    @property
+    def steps_done(self) -> int:
+        """From which step it would go on."""
+        folder = self.run_folder
+        if folder is None:
+            return 0
+        if folder.is_finished:
+            return self.n_timesteps
+        names = [path.name.removeprefix("step_") for path in folder.checkpoint_folder.glob("step_*")]
+        return max((int(name) for name in names if name.isdecimal()), default=0)
+
+    @property
+    def is_finished(self) -> bool:
+        folder = self.run_folder
+        return folder is not None and folder.is_finished
+
+    @property
+    def _env_name(self) -> str:
+        return self.env_id.replace("/", "-").replace(":", "-")
+
+    def __str__(self) -> str:
+        settings = "".join(f" {key}={_to_yaml(value)}" for key, value in self.settings.items())
+        return f"{self.algo} {self.env_id}{settings} seed {self.seed}"
+
+    def start(self) -> subprocess.Popen:
+        """
+        Start the run, or resume it.
+
+        :return: the process; it stops with a checkpoint on SIGTERM, and at once if this process dies
+        """
+        folder = self.run_folder
+        arguments = self.arguments if folder is None else ["--resume", str(folder.path)]
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", "experiments.jobs", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                cwd=ROOT,
+                env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
+                start_new_session=True,  # a Ctrl-C in the terminal is not for it
+            )
+
+    def last_lines(self, n: int = 3) -> list[str]:
+        """:return: of the log"""
+        if not self.log.is_file():
+            return []
+        with self.log.open(errors="replace") as lines:
+            return [line.rstrip() for line in deque((line for line in lines if line.strip()), n)]
+
+    @property
+    def final_return(self) -> float | None:
+        """The mean of the last evaluation."""
+        folder = self.run_folder
+        evaluations = None if folder is None else Run.open(folder.path).evaluations
+        return None if evaluations is None else float(evaluations.returns[-1].mean())
+
+
+def eval_freq(n_timesteps: int) -> int:
+    """:return: steps between evaluations: the paper's 20,000, and in a short run a twentieth of it"""
+    return min(20_000, max(n_timesteps // 20, 1))
+
+
+def stop(processes: Sequence[subprocess.Popen]) -> None:
+    """Tell processes to stop, and wait until they have written their checkpoints; those that have ended are closed."""
+    for process in processes:
+        if process.poll() is None:
+            process.terminate()
+    for process in processes:
+        process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
+
+
+def run(job: Job) -> int:
+    """
+    Run a job to its end; if it is interrupted, it stops with a checkpoint.
+
+    :return: the exit status of ``train.py``
+    """
+    process = job.start()
+    try:
+        while process.poll() is None:
+            time.sleep(POLL_SECONDS)
+    finally:
+        stop([process])
+    return process.returncode
+
+
+def import_ray() -> Any:
+    """:raises ValueError: if Ray is not installed, with the command that installs it"""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise ValueError('Runs are distributed by Ray: pip install "sb3-tdc[tune]"') from error
+
+
+@contextmanager
+def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
+    """
+    Ray, as long as the context lasts.
+
+    :param address: of a cluster that shares this file system; None for this machine
+    :param n_jobs: how many jobs at once on this machine; None for as many as there are cores
+    :return: the module
+    :raises ValueError: if Ray is not installed, or the cluster cannot be reached
+    """
+    ray = import_ray()
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address is None:
+        options |= {"num_cpus": n_jobs or count_cores(), "include_dashboard": False}
+    try:
+        ray.init(address=address or "local", **options)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ValueError(f"Ray did not start: {' '.join(str(error).split())}") from error
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as a Ctrl-C
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def count_cores() -> int:
+    """:return: that this process may use"""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _to_yaml(value: Any) -> str:
+    text = yaml.safe_dump(value, default_flow_style=True, width=sys.maxsize)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _die_with_parent() -> None:
+    """The other end of the standard input is the parent's: it closes when the parent dies, however it does."""
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def main(argv: Sequence[str]) -> int:
+    """:return: the exit status of ``train.py``"""
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    sys.orig_argv = ["python", "train.py", *argv]  # what to type to do the same, for the run's command.txt
+    return train.main(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,221 @@
+"""The run matrix: what is run, for how long; then real matrices, killed and resumed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments import run
+from experiments.jobs import Job, eval_freq
+from experiments.results import find_runs
+from experiments.suites import SUITES, Cell
+from sb3_tdc import TDC
+from sb3_tdc.run_folder import RunFolder
+from tests.experiments.test_results import make_run
+
+ROOT = Path(__file__).parents[2]
+SMALL = {"learning_starts": 20, "batch_size": 8, "buffer_size": 500}
+SMALL_TDC = {**SMALL, "policy_kwargs": {"net_arch": [8], "n_quantiles": 4}}
+# The matrix with a suite of its own: small networks on Pendulum, and one run that fails
+CODE = f"""
+import sys
+from experiments.suites import SUITES, Cell
+from experiments.run import main
+SMALL = {SMALL_TDC}
+SUITES["fig1"] = [Cell("tdc", "Pendulum-v1", SMALL), Cell("tdc", "Pendulum-v1", {{**SMALL, "lam": 0.0}})]
+SUITES["fig2"] = [Cell("tdc", "Pendulum-v1", {{**SMALL, "lam": -1.0}}), Cell("tdc", "Pendulum-v1", SMALL)]
+sys.exit(main())
+"""
+
+
+def plan(suite, seeds=(1,), scale=0.02, only=(), logs=Path("/logs")):
+    return run.make_plan(run.select(SUITES[suite], only), seeds, scale, logs)
+
+
+def test_jobs_of_the_paper():
+    fig1 = plan("fig1", seeds=(1, 2))
+    assert len(fig1.jobs) == 2 * 4 * 5  # seeds × algorithms × tasks
+    assert [job.seed for job in fig1.jobs] == [1] * 20 + [2] * 20
+    assert len(fig1.missing) == 5
+    assert "meow on Ant-v4: this version of the package has no MEOW" in fig1.missing
+    assert len(plan("fig2").jobs) == 10
+    assert len(plan("fig3").jobs) == 10
+    assert [job.settings for job in plan("figS1").jobs] == [{"lam": 0.0}, {"lam": 1.0}]
+
+
+def test_cells_of_two_suites_may_be_one_job():
+    cells = [Cell("tdc", "Humanoid-v4", {"stochastic_actor": False}), Cell("tdc", "Humanoid-v4", {"lam": 1.0})]
+    jobs = run.make_plan(cells, (1,), 1.0, Path("/logs")).jobs  # λ is 1 there, and the head deterministic
+    assert [(job.settings, job.logs) for job in jobs] == [({}, Path("/logs/scale_1/seed_1"))]
+
+
+def test_other_simulators_are_missing_with_a_hint():
+    missing = plan("fig5").missing
+    assert "tdc on HopperBulletEnv-v0: pip install pybullet_envs_gymnasium" in missing
+    assert any("Isaac Lab" in sentence for sentence in missing)
+
+
+def test_scaled():
+    # HalfCheetah: 0.02 × 1,500,000 steps; 25,000 random steps are more than a tenth; evaluations at 1/20
+    def cheetah(scale):
+        (job,) = plan("fig1", scale=scale, only=["tdc", "HalfCheetah-v4"]).jobs
+        return job
+
+    assert (cheetah(0.02).n_timesteps, cheetah(0.02).config["learning_starts"]) == (30_000, 3000)
+    assert (cheetah(1).n_timesteps, cheetah(1).config["learning_starts"]) == (1_500_000, 25_000)
+    assert (eval_freq(30_000), eval_freq(1_500_000), eval_freq(7)) == (1500, 20_000, 1)
+    assert "-params" not in cheetah(1).arguments  # nothing differs from hyperparams/
+
+
+def test_selected():
+    assert {(c.algo, c.env_id) for c in run.select(SUITES["fig1"], ["sac", "Ant-v4"])} == {("sac", "Ant-v4")}
+    assert len(run.select(SUITES["fig1"], ["Ant-v4"])) == 5
+    with pytest.raises(ValueError, match="did you mean 'Hopper-v4'"):
+        run.select(SUITES["fig1"], ["Hoper-v4"])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "n_jobs", "expected"),
+    [([], 2, 0), ([3, 3, 3], 1, 9), ([3, 3, 3], 2, 6), ([5, 1, 1, 1], 2, 5), ([1, 1, 5], 2, 6)],
+)
+def test_estimate(seconds, n_jobs, expected):
+    assert run.estimate_seconds(seconds, n_jobs) == expected
+
+
+def test_rates_are_those_of_finished_runs(tmp_path):
+    for seed, seconds, steps in ((1, 10, 1000), (2, 20, 1000), (3, 40, 1000), (4, 1, None)):
+        folder = make_run(tmp_path, seed=seed, steps=steps)
+        (folder.path / "progress.csv").write_text(f"time/total_timesteps,time/time_elapsed\n500,1\n1000,{seconds}\n")
+    assert run.read_rates(tmp_path) == {("tdc", "Hopper-v4"): 50}  # the median of 100, 50 and 25
+    assert run.read_rates(tmp_path / "nothing") == {}
+
+
+def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
+    job = Job("tdc", "Pendulum-v1", 1, 100, tmp_path, {"lam": 0.5})
+    assert job.run_folder is None
+    folder = RunFolder.create(tmp_path, "tdc", "Pendulum-v1")
+    folder.write_config({**job.config, "lam": 0.7}, {"seed": 1, "eval_freq": 5})
+    with pytest.raises(ValueError, match=r"another run \(lam 0.7 instead of 0.5\)"):
+        _ = job.run_folder
+    folder.write_config(job.config, {"seed": 1, "eval_freq": 5})
+    assert (job.run_folder.path, job.steps_done) == (folder.path, 0)
+    (folder.checkpoint_folder / "step_000000000040").mkdir(parents=True)
+    assert (job.steps_done, job.is_finished) == (40, False)
+    folder.mark_finished(100)
+    assert (job.steps_done, job.is_finished) == (100, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["figg1"], "did you mean 'fig1'"),
+        (["fig1", "--scale", "-1"], "--scale must be above 0"),
+        (["fig1", "--seeds", "0"], "at least 1"),
+        (["fig1", "--jobs", "0"], "--jobs must be at least 1"),
+        (["fig1", "--only", "ppo"], "not in the suite"),
+    ],
+)
+def test_bad_arguments(arguments, sentence, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run.main([*arguments, "--logs", str(tmp_path)])
+    assert stopped.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+def test_without_ray(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SystemExit):
+        run.main(["figS1", "--scale", "0.001", "--logs", str(tmp_path)])
+    assert 'pip install "sb3-tdc[tune]"' in capsys.readouterr().err
+
+
+def test_dry_run_measures(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(SUITES, "fig1", [Cell("tdc", "Pendulum-v1", SMALL_TDC), Cell("meow", "Pendulum-v1")])
+    assert run.main(["fig1", "--seeds", "2", "--scale", "0.001", "--dry-run", "--logs", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "no MEOW" in out
+    assert out.count("run    tdc Pendulum-v1") == 2
+    assert out.count("steps/s") == 1
+    assert "2 of 2 to run" in out
+    assert not any(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- real matrices
+
+
+def start(suite, logs, *arguments):
+    command = [sys.executable, "-W", "ignore", "-c", CODE, suite, "--seeds", "1", "--logs", str(logs), *arguments]
+    return subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def finish(process):
+    return process.communicate(timeout=300)[0], process.returncode
+
+
+def fingerprint(run):
+    state = TDC.load(run.folder.model, device="cpu").policy.state_dict()
+    return {key: value.tolist() for key, value in state.items()}, run.evaluations.returns.tolist()
+
+
+def descendants(pid):
+    children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True).stdout.split()
+    return [int(pid), *(p for child in children for p in descendants(child))]
+
+
+def is_running(pid):
+    try:
+        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+def test_a_failing_run_does_not_stop_the_rest_and_finished_ones_are_skipped(tmp_path):
+    out, status = finish(start("fig2", tmp_path, "--scale", "0.0003"))
+    assert status == 1, out
+    assert "failed tdc Pendulum-v1" in out
+    assert "lam must be" in out
+    runs, _ = find_runs(tmp_path)
+    assert [r.is_finished for r in runs] == [True]
+    out, status = finish(start("fig2", tmp_path, "--scale", "0.0003"))
+    assert status == 1, out
+    assert "1 of 2 runs are finished already" in out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_matrix_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
+    scale = ["--scale", "0.003", "--jobs", "2"]  # 3,000 steps
+    out, status = finish(start("fig1", tmp_path / "alone", *scale))
+    assert status == 0, out
+
+    process = start("fig1", tmp_path / "killed", *scale)
+    deadline = time.monotonic() + 200
+    while len(list((tmp_path / "killed").rglob("checkpoints/step_000000000[1-9]*"))) < 2:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    family = descendants(process.pid)
+    os.kill(process.pid, how)
+    out, status = finish(process)
+    assert status == {signal.SIGKILL: -9, signal.SIGINT: 130}[how], out
+    deadline = time.monotonic() + 30
+    while any(is_running(pid) for pid in family):  # nothing goes on alone
+        assert time.monotonic() < deadline, [pid for pid in family if is_running(pid)]
+        time.sleep(0.1)
+    assert not all(r.is_finished for r in find_runs(tmp_path / "killed")[0])
+
+    out, status = finish(start("fig1", tmp_path / "killed", *scale))
+    assert status == 0, out
+    assert "resume tdc" in out
+    alone, killed = (find_runs(tmp_path / name)[0] for name in ("alone", "killed"))
+    assert len(alone) == len(killed) == 2
+    for one, other in zip(alone, killed, strict=True):
+        assert fingerprint(one) == fingerprint(other)
