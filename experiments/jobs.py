@@ -187,7 +187,6 @@ def run(job: Job) -> int:
 
 def import_ray() -> Any:
     """:raises ValueError: if Ray is not installed, with the command that installs it"""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         return importlib.import_module("ray")
@@ -213,7 +212,7 @@ def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
         ray.init(address=address or "local", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ValueError(f"Ray did not start: {' '.join(str(error).split())}") from error
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as a Ctrl-C
+    signal.signal(signal.SIGTERM, lambda *_: os.kill(os.getpid(), signal.SIGINT))  # as a Ctrl-C
     try:
         yield ray
     finally:
