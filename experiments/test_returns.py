@@ -20,6 +20,7 @@ from experiments.results import Run, find_runs
 from sb3_tdc.arguments import Parser
 from sb3_tdc.experiment import ALGORITHMS, make_envs
 from sb3_tdc.hyperparams import parse
+from sb3_tdc.safe_load import load_safely
 
 FILE = "test_returns.npz"
 EPISODES = 100
@@ -86,7 +87,7 @@ def measure_run(run: Run, episodes: int = EPISODES) -> np.ndarray:
         training=False,
     )
     with closing(env):
-        model = ALGORITHMS[run.algo].load(run.folder.model, device="cpu", buffer_size=1)
+        model = load_safely(run.folder.model, device="cpu", algorithm=ALGORITHMS[run.algo], buffer_size=1)
         returns = play_episodes(model, env, episodes)
     part = run.folder.path / f".{FILE}.part.npz"
     np.savez(part, returns=returns, checksum=before, first_seed=FIRST_SEED)

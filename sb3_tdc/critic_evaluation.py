@@ -32,7 +32,6 @@ class CriticEvaluation(StoppableEvaluation):
         self.episodes: list[Episode] = []
         self.elapsed = 0.0
         self.seconds_per_figure = _SECONDS_OF_FIRST_FIGURE
-        self.start = time.perf_counter()
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         super()._log_success_callback(locals_, globals_)
@@ -60,8 +59,9 @@ class CriticEvaluation(StoppableEvaluation):
 
     def _draw(self, episodes: list[Episode]) -> None:
         start = time.perf_counter()
+        seconds = (time.time_ns() - self.model.start_time) / 1e9
         has_tensorboard = any(isinstance(writer, TensorBoardOutputFormat) for writer in self.logger.output_formats)
-        if not has_tensorboard or self.elapsed + self.seconds_per_figure > _SHARE * (start - self.start):
+        if not has_tensorboard or self.elapsed + self.seconds_per_figure > _SHARE * seconds:
             return
         try:
             picture = render(make_figure(episodes, f"Evaluation at step {self.num_timesteps:,}"))
