@@ -31,7 +31,7 @@ from sb3_tdc.checkpoint import Checkpoints, Restorable
 STEPS = 300
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
 # On the wall clock
-_TIMES = ("t", "time/fps", "time/time_elapsed")
+_TIMES = ("t", "time/fps", "time/time_elapsed", "time/critics_elapsed")
 
 
 class Reach(gym.Env):
