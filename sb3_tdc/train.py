@@ -104,10 +104,9 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
     :raises ValueError: if there is nothing to resume, or an argument contradicts the run's
     """
     folder = RunFolder.open(args.resume)
-    try:
-        stored = folder.args
-    except OSError as error:
-        raise ValueError(f"{folder.path} was stopped before its run began: start it anew ({error})") from error
+    if not (folder.path / folder.env_name / "args.yml").is_file():
+        raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
+    stored = folder.args
     for name, value in _plain(argparse.Namespace(**given)).items():
         if name not in (*_OF_THE_PROCESS, "resume") and value != stored.get(name, value):
             flag = f"--{name.replace('_', '-')}"
