@@ -24,7 +24,7 @@ from sb3_tdc.experiment import ALGORITHMS, check_env_id
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
 
 _ARGUMENTS = "search.yml"
-_STATE = "ray"
+_LONGEST_STEP_SECONDS = 5.0
 
 
 # ---------------------------------------------------------------- trials
@@ -44,32 +44,27 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
             self.processes = [job.start() for job in self.jobs if not job.is_finished]
 
         def step(self) -> dict[str, Any]:
-            """Wait for the next evaluation of all seeds."""
+            """Wait for the next evaluation of all seeds, but not for long: only between steps can a trial be stopped."""
+            deadline = time.monotonic() + _LONGEST_STEP_SECONDS
             while True:
                 has_ended = all(process.poll() is not None for process in self.processes)
                 returns = read_returns(self.jobs)
-                if has_ended or returns.shape[1] > self.n_reported:
+                if has_ended or returns.shape[1] > self.n_reported or time.monotonic() > deadline:
                     break
                 time.sleep(POLL_SECONDS)
             failed = [job for job in self.jobs if has_ended and not job.is_finished]
-            if failed or not returns.size:
+            if failed:
                 raise RuntimeError("; ".join(f"{job}: see {job.log}: {' | '.join(job.last_lines())}" for job in failed))
-            self.n_reported = min(self.n_reported + 1, returns.shape[1])
+            self.n_reported = n = min(self.n_reported + 1, returns.shape[1])
             return {
-                "steps": self.n_reported * eval_freq(self.jobs[0].n_timesteps),
-                "mean_return": float(returns[:, : self.n_reported].mean()),
-                "last_return": float(returns[:, self.n_reported - 1].mean()),
-                "done": has_ended and self.n_reported == returns.shape[1],
+                "steps": n * eval_freq(self.jobs[0].n_timesteps),
+                "mean_return": float(returns[:, :n].mean()) if n else float("nan"),
+                "last_return": float(returns[:, n - 1].mean()) if n else float("nan"),
+                "done": has_ended and n == returns.shape[1],
             }
 
         def cleanup(self) -> None:
             stop(self.processes)
-
-        def save_checkpoint(self, checkpoint_dir: str) -> dict[str, Any]:
-            return {"n_reported": self.n_reported}  # the rest is in the folders of the runs
-
-        def load_checkpoint(self, checkpoint: dict[str, Any] | None) -> None:
-            self.n_reported = checkpoint["n_reported"] if checkpoint else 0
 
     return Trial
 
@@ -95,23 +90,23 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
     from ray import tune
     from ray.tune.schedulers import ASHAScheduler
 
+    if not args.asha:  # ASHA needs all of them, to compare: a finished one reports at once what it has
+        trials = {name: jobs for name, jobs in trials.items() if not all(job.is_finished for job in jobs)}
+    if not trials:
+        return True, []
     n_cpus = max(map(len, trials.values()))  # a CPU and a thread for each seed
-    trainable = tune.with_resources(make_trainable(tune, trials), {"cpu": n_cpus})
-    folder = str(args.folder / _STATE)
-    if args.resume is not None and tune.Tuner.can_restore(folder):
-        tuner = tune.Tuner.restore(folder, trainable, restart_errored=True)
-    else:
-        scheduler = ASHAScheduler(
-            time_attr="steps", max_t=args.n_timesteps, grace_period=max(args.n_timesteps // 9, 1), reduction_factor=3
-        )
-        tuner = tune.Tuner(
-            trainable,
-            param_space={"trial": tune.grid_search(list(trials))},
-            tune_config=tune.TuneConfig(
-                metric="mean_return", mode="max", scheduler=scheduler if args.asha else None, reuse_actors=False
-            ),
-            run_config=tune.RunConfig(name=_STATE, storage_path=str(args.folder), verbose=1),
-        )
+    scheduler = ASHAScheduler(
+        time_attr="steps", max_t=args.n_timesteps, grace_period=max(args.n_timesteps // 9, 1), reduction_factor=3
+    )
+    # Also where a search is resumed: all that counts is in the folders of the runs, and Ray's state would be unpickled
+    tuner = tune.Tuner(
+        tune.with_resources(make_trainable(tune, trials), {"cpu": n_cpus}),
+        param_space={"trial": tune.grid_search(list(trials))},
+        tune_config=tune.TuneConfig(
+            metric="mean_return", mode="max", scheduler=scheduler if args.asha else None, reuse_actors=False
+        ),
+        run_config=tune.RunConfig(name="ray", storage_path=str(args.folder), verbose=1),
+    )
     results = tuner.fit()
     failed = [str(error).strip().splitlines()[-1] for error in results.errors]
     return results.num_terminated + results.num_errors == len(trials), failed
