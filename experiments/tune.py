@@ -44,7 +44,7 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
             self.processes = [job.start() for job in self.jobs if not job.is_finished]
 
         def step(self) -> dict[str, Any]:
-            """Wait for the next evaluation of all seeds, but not for long: only between steps can a trial be stopped."""
+            """Wait for the next evaluation of all seeds, not for long: only between steps can a trial be stopped."""
             deadline = time.monotonic() + _LONGEST_STEP_SECONDS
             while True:
                 has_ended = all(process.poll() is not None for process in self.processes)
@@ -254,7 +254,7 @@ def _check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
     model = parse({**entry, **settings}, ALGORITHMS[algo], "--search and -params").model
     with closing(gym.make(env_id)) as env:
         try:
-            ALGORITHMS[algo](env=env, device="cpu", **{**model, "buffer_size": 1, "_init_setup_model": False})
+            ALGORITHMS[algo](env=env, device="cpu", **{**model, "buffer_size": 1_000})
         except (ValueError, AssertionError, TypeError) as error:
             raise ValueError(f"--search and -params: {' '.join(str(error).split())}") from error
 
