@@ -154,7 +154,8 @@ def measure_rate(job: Job) -> float:
         arguments = [*measured.arguments, "--eval-freq", "-1", "--checkpoint-freq", "-1", "--verbose", "0"]
         experiment = train.make_experiment(train.make_parser().parse_args(arguments))
         experiment.hyperparams.callbacks.append(lambda: clock)
-        train_experiment(experiment)
+        if train_experiment(experiment).interrupted:
+            raise KeyboardInterrupt
     return (_LAST - _FIRST) / (clock.times[_LAST] - clock.times[_FIRST])
 
 
@@ -292,6 +293,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             outcome = run_jobs(ray, to_run, args.jobs)
     except ValueError as error:
         parser.fail(error)
+    except KeyboardInterrupt:
+        return 130
     for sentence in outcome.failed:
         print(f"failed {sentence}", file=sys.stderr)
     if outcome.stopped:

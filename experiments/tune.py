@@ -96,7 +96,11 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
         return True, []
     n_cpus = max(map(len, trials.values()))  # a CPU and a thread for each seed
     scheduler = ASHAScheduler(
-        time_attr="steps", max_t=args.n_timesteps, grace_period=max(args.n_timesteps // 9, 1), reduction_factor=3
+        time_attr="steps",
+        max_t=args.n_timesteps,
+        grace_period=max(args.n_timesteps // 9, 1),
+        reduction_factor=3,
+        stop_last_trials=False,  # behind its last evaluation, a run has its model to write
     )
     # Also where a search is resumed: all that counts is in the folders of the runs, and Ray's state would be unpickled
     tuner = tune.Tuner(
