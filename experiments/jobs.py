@@ -212,7 +212,7 @@ def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
         ray.init(address=address or "local", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ValueError(f"Ray did not start: {' '.join(str(error).split())}") from error
-    signal.signal(signal.SIGTERM, lambda *_: os.kill(os.getpid(), signal.SIGINT))  # as a Ctrl-C
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as a Ctrl-C, also where that is ignored (nohup)
     try:
         yield ray
     finally:
