@@ -1,8 +1,9 @@
 """
 What checkpoints cost: how long training waits for them, and what they write.
 
-``python -m benchmarks.checkpoints`` trains TDC with the paper's hyperparameters (but for a shorter warm-up, so that it
-is training that is measured), prints a table and writes it to ``docs/benchmarks/checkpoints.md``.
+``python -m benchmarks.checkpoints`` trains TDC with the paper's hyperparameters for a few thousand steps, for the time
+of a step, then goes on without updates until checkpoints have been written (their pause is the same), prints a table
+and writes it to ``docs/benchmarks/checkpoints.md``.
 """
 
 import argparse
@@ -22,24 +23,30 @@ from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints
 from sb3_tdc.hyperparams import hyperparams_file, parse, read_entry
 
 ENVIRONMENTS = ("HalfCheetah-v4", "Humanoid-v4")
-WARM_UP = 1_000
+WARM_UP, TIMED = 300, 2_000
 
 
 class Clock(BaseCallback):
-    """When every checkpoint was written, and what was on disk then."""
+    """The seconds of a training step, and those that training has waited for every checkpoint."""
 
     is_checkpointed = False
 
     def __init__(self, checkpoints: Checkpoints):
         super().__init__()
         self.checkpoints = checkpoints
-        self.entries: list[tuple[int, float, float, int]] = []
+        self.per_step = 0.0
+        self.pauses: list[float] = []
+        self.step, self.seconds = 0, 0.0
 
     def _on_rollout_start(self) -> None:  # behind the checkpoints
-        step = self.checkpoints.last_step
-        if step is not None and (not self.entries or self.entries[-1][0] != step):
-            size = disk_usage(self.checkpoints.store.folder)
-            self.entries.append((step, time.perf_counter(), self.checkpoints.seconds, size))
+        if self.num_timesteps == 2 * WARM_UP:
+            self.start = time.perf_counter()
+        elif self.num_timesteps == 2 * WARM_UP + TIMED:
+            self.per_step = (time.perf_counter() - self.start) / TIMED
+            self.model.gradient_steps = 0
+        if self.checkpoints.last_step not in (None, 0, self.step):
+            self.pauses.append(self.checkpoints.seconds - self.seconds)
+        self.step, self.seconds = self.checkpoints.last_step or 0, self.checkpoints.seconds
 
     def _on_step(self) -> bool:
         return True
@@ -58,9 +65,7 @@ def measure(env_id: str, n_checkpoints: int, freq: int, folder: Path) -> dict[st
     model = TDC(env=gym.make(env_id), seed=1, device="cpu", **{**_model_arguments(entry), "learning_starts": WARM_UP})
     checkpoints = Checkpoints(folder / "checkpoints", freq, verbose=0)
     clock = Clock(checkpoints)
-    model.learn((n_checkpoints + 1) * freq + 10, callback=[checkpoints, clock])
-    pauses = np.diff([seconds for _, _, seconds, _ in clock.entries])[1:]  # of the second one on: all of it training
-    times = np.diff([moment for _, moment, _, _ in clock.entries])[1:]
+    model.learn(n_checkpoints * freq + 10, callback=[checkpoints, clock])
     segments = [path.stat().st_size for path in sorted((folder / "checkpoints" / "replay").iterdir())]
     newest = max((folder / "checkpoints").glob("step_*"))
     buffer = model.replay_buffer
@@ -68,10 +73,10 @@ def measure(env_id: str, n_checkpoints: int, freq: int, folder: Path) -> dict[st
     state = disk_usage(newest)
     checkpoints.store.close()
     return {
-        "pause, median (s)": float(np.median(pauses)),
-        "pause, longest (s)": float(np.max(pauses)),
-        "between two checkpoints (s)": float(np.median(times)),
-        "share of training time (%)": 100 * float(pauses.sum() / times.sum()),
+        "training step (ms)": 1e3 * clock.per_step,
+        "pause, median (s)": float(np.median(clock.pauses)),
+        "pause, longest (s)": max(clock.pauses),
+        "share of training time (%)": 100 * float(np.median(clock.pauses)) / (freq * clock.per_step),
         "written per checkpoint (MB)": (segments[-1] + state) / 1e6,
         "of it transitions (MB)": segments[-1] / 1e6,
         "on disk with a full buffer of 1,000,000 (MB)": (segments[-1] / freq * buffer.buffer_size + 2 * state) / 1e6,
@@ -99,7 +104,7 @@ def report(results: dict[str, dict[str, float]], command: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--envs", nargs="+", default=list(ENVIRONMENTS))
-    parser.add_argument("--checkpoints", type=int, default=3, help="that are measured")
+    parser.add_argument("--checkpoints", type=int, default=4, help="that are measured")
     parser.add_argument("--freq", type=int, default=DEFAULT_FREQ, help="steps between checkpoints")
     parser.add_argument("--num-threads", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="where to write them (default: a temporary folder)")

@@ -9,6 +9,7 @@ import argparse
 import collections
 import json
 import os
+import pickle
 import random
 import re
 import shutil
@@ -90,6 +91,10 @@ def outcome(folder: Path) -> dict[str, Any]:
     for name, value in vars(model.replay_buffer).items():
         if isinstance(value, (np.ndarray, int, bool)):
             found[f"replay_buffer.{name}"] = digest(value)
+    for name in (Path("Hopper-v4") / "vecnormalize.pkl", Path("best_model_vecnormalize.pkl")):
+        statistics = pickle.loads((folder / name).read_bytes())
+        parts = [statistics.obs_rms.mean, statistics.obs_rms.var, statistics.obs_rms.count, statistics.ret_rms.var]
+        found[str(name)] = digest(parts)
     saved = sorted(path.name for path in folder.glob("rl_model_*_steps.zip"))
     found["saved models"] = {name: digest(TDC.load(folder / name, device="cpu").policy.state_dict()) for name in saved}
     found["files"] = sorted(path.name for path in folder.iterdir() if "tfevents" not in path.name)
