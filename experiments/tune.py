@@ -339,7 +339,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not is_complete:
         print(f"Stopped. To go on:\n  python tune.py --resume {shlex.quote(str(args.folder))}", file=sys.stderr)
         return 130
-    write_results(args.folder, candidates, args.searched)
+    if any(read_returns(jobs).size for jobs in candidates):
+        write_results(args.folder, candidates, args.searched)
     return int(bool(failed))
 
 

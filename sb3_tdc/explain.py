@@ -246,13 +246,13 @@ def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
     axes.plot([0, 1], [0, 1], ":", color="grey", lw=1)
     for critic in range(episodes[0].quantiles.shape[1]):
         color = _COLORS[critic % len(_COLORS)]
-        lines = np.array([episode.frequencies[critic] for episode in known]).reshape(len(known), -1)
+        lines = [episode.frequencies[critic] for episode in known]
         levels = quantile_midpoints(episodes[0].quantiles.shape[2]).numpy()
         for line in lines:
             axes.plot(levels, line, color=color, lw=0.6, alpha=0.4)
         if len(lines):
             axes.plot(
-                levels, lines.mean(axis=0), _STYLES[critic % 2], color=color, lw=1.8, label=f"critic {critic + 1}"
+                levels, np.mean(lines, axis=0), _STYLES[critic % 2], color=color, lw=1.8, label=f"critic {critic + 1}"
             )
     style_axes(axes, f"Calibration, {_count(known)}", "quantile level", "returns at or below the quantile")
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
