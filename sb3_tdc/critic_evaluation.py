@@ -53,9 +53,11 @@ class CriticEvaluation(StoppableEvaluation):
         self.episodes.append(self.recordings.pop(i).finish(not step["info"].get("TimeLimit.truncated", False)))
         if len(self.episodes) == self.n_eval_episodes:
             episodes, self.episodes = self.episodes, []
-            for name, value in summarise(episodes).items():
+            summary = summarise(episodes)
+            for name, value in summary.items():
                 self.logger.record(f"eval/{name}", value)
-            self._draw(episodes)
+            if summary:
+                self._draw(episodes)
 
     def _draw(self, episodes: list[Episode]) -> None:
         start = time.perf_counter()

@@ -96,6 +96,24 @@ def test_unknown_returns_do_not_count():
     assert explain.summarise([episode, unknown]) == explain.summarise([episode])
 
 
+def test_unknown_returns_can_be_drawn():
+    pytest.importorskip("matplotlib")
+    unknown = explain.Episode(np.arange(3), np.zeros((3, 2, 4)), np.zeros(3, int), np.full(3, np.nan))
+    figure = explain.make_figure([unknown], "title")
+    assert explain.render(figure).ndim == 3
+    assert len(figure.axes[-2].lines) == 1  # the diagonal of the calibration alone
+
+
+def test_episodes_too_short_to_know_a_return_leave_no_trace_in_the_log(tmp_path, monkeypatch):
+    """As Pendulum's, which a time limit of 200 steps ends."""
+    monkeypatch.setattr(critic_evaluation, "_SHARE", 1e9)
+    argv = ["--env", "Pendulum-v1", "-n", 60, "-f", tmp_path, "--eval-freq", 50, "--eval-episodes", 1, "--verbose", 0]
+    assert train.main([str(a) for a in [*argv, "-params", "learning_starts:100"]]) == 0
+    header = (tmp_path / "tdc" / "Pendulum-v1_1" / "progress.csv").read_text().splitlines()[0]
+    assert "eval/mean_reward" in header
+    assert "eval/overestimation" not in header
+
+
 def test_play_records_what_the_critics_say_about_the_action_that_is_played():
     env = make_env(length=30)
     model = make_model(env, lam=0.5)
