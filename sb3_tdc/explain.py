@@ -278,7 +278,8 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
                 label=f"critic {critic + 1}: {np.mean(means):+.3g}",
             )
     style_axes(axes, f"Overestimation, {_count(episodes)}", "step", "predicted mean − realised")
-    axes.legend(frameon=False, fontsize="small")
+    if any(np.isfinite(episode.returns).any() for episode in episodes):
+        axes.legend(frameon=False, fontsize="small")
 
 
 def make_figure(episodes: Sequence[Episode], title: str, note: str = "") -> Any:

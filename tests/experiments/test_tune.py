@@ -15,7 +15,7 @@ from experiments.jobs import Job
 from experiments.search_space import LAMBDAS, Distribution, make_candidates, parse_space
 from sb3_tdc import train
 from sb3_tdc.run_folder import RunFolder
-from tests.experiments.test_run import ROOT, descendants, is_running
+from tests.experiments.test_run import ROOT, is_running, runs_of
 
 SMALL = ["learning_starts:20", "batch_size:8", "buffer_size:500", "policy_kwargs:{net_arch: [8], n_quantiles: 4}"]
 
@@ -145,7 +145,8 @@ def test_a_search_that_is_killed_goes_on_to_the_same_end(tmp_path):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    family = descendants(process.pid)
+    family = runs_of(process.pid)
+    assert family
     os.kill(process.pid, signal.SIGKILL)
     finish(process)
     deadline = time.monotonic() + 30
