@@ -109,7 +109,12 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
         tune_config=tune.TuneConfig(
             metric="mean_return", mode="max", scheduler=scheduler if args.asha else None, reuse_actors=False
         ),
-        run_config=tune.RunConfig(name="ray", storage_path=str(args.folder), verbose=1),
+        run_config=tune.RunConfig(
+            name="ray",
+            storage_path=str(args.folder),
+            verbose=1,
+            checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),  # the runs have their own
+        ),
     )
     results = tuner.fit()
     failed = [str(error).strip().splitlines()[-1] for error in results.errors]
