@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tdc.plot import style_axes
+
 _TDC = "TDC"
 _OTHER_PAIRS = ("SB3 TD3 / TDC, readable update", "SB3 SAC / TDC, stochastic head")
 
@@ -20,7 +22,7 @@ def quartiles(values: np.ndarray) -> str:
     return f"**{middle:.2f}** ({low:.2f}–{high:.2f})"
 
 
-def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float | None]) -> list[str]:
+def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float]) -> list[str]:
     """Rows of peers, columns of threads: time of a peer over the time of TDC."""
     threads = list(results)
     header = [
@@ -78,16 +80,15 @@ def draw_scaling(scaling: dict[str, Any], path: Path) -> None:
             for name, style in ((_TDC, "o-"), ("matrix products", "x:")):
                 medians = [np.median(times[name]) for times in result[kind].values()]
                 axes.plot(sizes, medians, style, color=f"C{int(threads) - 1}", label=f"{name}, {threads}t", ms=4)
-        axes.set(xscale="log", yscale="log", xlabel=kind, ylabel="ms per gradient step")
+        axes.set(xscale="log", yscale="log")
         axes.set_xticks(sizes, [f"{n:,}" for n in sizes])
         axes.minorticks_off()
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        style_axes(axes, "", kind, "ms per gradient step")
     axes.legend(frameon=False)
     figure.savefig(path, dpi=150)
 
 
-def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str, int], float | None]) -> None:
+def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str, int], float]) -> None:
     """Write ``speed.md``, ``speed.json`` and ``scaling.png``."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "speed.json").write_text(json.dumps(results))

@@ -23,8 +23,9 @@ import yaml
 from experiments.results import Run, same_settings
 from sb3_tdc import train
 from sb3_tdc.checkpoint import DEFAULT_FREQ
+from sb3_tdc.checkpoint.store import stored_steps
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
-from sb3_tdc.run_folder import RunFolder
+from sb3_tdc.run_folder import RunFolder, folder_name
 
 ROOT = Path(__file__).resolve().parents[1]
 # How often a process is looked at
@@ -103,8 +104,7 @@ class Job:
             return 0
         if folder.is_finished:
             return self.n_timesteps
-        names = [path.name.removeprefix("step_") for path in folder.checkpoint_folder.glob("step_*")]
-        return max((int(name) for name in names if name.isdecimal()), default=0)
+        return max(stored_steps(folder.checkpoint_folder), default=0)
 
     @property
     def is_finished(self) -> bool:
@@ -113,7 +113,7 @@ class Job:
 
     @property
     def _env_name(self) -> str:
-        return self.env_id.replace("/", "-").replace(":", "-")
+        return folder_name(self.env_id)
 
     def __str__(self) -> str:
         settings = "".join(f" {key}={_to_yaml(value)}" for key, value in self.settings.items())

@@ -19,9 +19,10 @@ from experiments.figures import COLORS, draw_sweep
 from experiments.jobs import POLL_SECONDS, Job, cluster, count_cores, eval_freq, stop
 from experiments.results import Run
 from experiments.search_space import LAMBDAS, make_candidates, parse_space
-from sb3_tdc.arguments import KeyValues, Parser, one_of
+from sb3_tdc.arguments import KeyValues, Parser, one_of, plain_arguments
 from sb3_tdc.experiment import ALGORITHMS, check_env_id
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
+from sb3_tdc.run_folder import folder_name
 
 _ARGUMENTS = "search.yml"
 _LONGEST_STEP_SECONDS = 5.0
@@ -303,9 +304,10 @@ def _read_arguments(args: argparse.Namespace, given: dict[str, Any]) -> None:
 def _make_folder(args: argparse.Namespace) -> Path:
     """:return: the next free one; it does not exist yet"""
     parent = args.logs.resolve() / "search" / args.algo
-    taken = [path.name.rpartition("_")[2] for path in parent.glob(f"{args.env.replace('/', '-')}_*")]
-    number = max((int(name) for name in taken if name.isdecimal()), default=0) + 1
-    return parent / f"{args.env.replace('/', '-')}_{number}"
+    name = folder_name(args.env)
+    taken = [path.name.rpartition("_")[2] for path in parent.glob(f"{name}_*")]
+    number = max((int(text) for text in taken if text.isdecimal()), default=0) + 1
+    return parent / f"{name}_{number}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -325,9 +327,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with cluster(args.address, args.jobs):
             if args.resume is None:
                 args.folder.mkdir(parents=True)
-                stored = {
-                    key: str(v) if isinstance(v, Path) else v for key, v in vars(args).items() if key != "searched"
-                }
+                stored = plain_arguments({key: value for key, value in vars(args).items() if key != "searched"})
                 (args.folder / _ARGUMENTS).write_text(yaml.safe_dump(stored))
             print(
                 f"{len(candidates)} candidates × {args.seeds} seeds, {args.n_timesteps:,} steps each, evaluated every "

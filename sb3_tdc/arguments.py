@@ -3,7 +3,8 @@
 import argparse
 import importlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import torch as th
@@ -80,6 +81,11 @@ def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:
     parser.add_argument("--device", default="auto", help="PyTorch device (cpu, cuda, ...)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
     parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the environment")
+
+
+def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """:return: arguments by name, as they are written to a folder"""
+    return {name: str(value) if isinstance(value, Path) else value for name, value in arguments.items()}
 
 
 def apply_common_arguments(args: argparse.Namespace, env_id: str) -> str:

@@ -36,7 +36,7 @@ class RunFolder:
 
         :param unique: append a UUID to the name
         """
-        env_name, parent = _env_name(env_id), Path(log_folder) / algo
+        env_name, parent = folder_name(env_id), Path(log_folder) / algo
         parent.mkdir(parents=True, exist_ok=True)
         number = max(_numbered(parent, env_name), default=0) + 1
         while True:
@@ -55,7 +55,7 @@ class RunFolder:
         :param number: of the run; 0 is the latest
         :raises ValueError: if there is none
         """
-        env_name, parent = _env_name(env_id), Path(log_folder) / algo
+        env_name, parent = folder_name(env_id), Path(log_folder) / algo
         runs = _numbered(parent, env_name)
         if not runs or (number and number not in runs):
             known = f"; there are {', '.join(map(str, sorted(runs)))}" if runs else suggest(env_id, _env_names(parent))
@@ -187,7 +187,8 @@ def _write_text(path: Path, text: str) -> None:
     save(lambda beside: beside.write_text(text), path)
 
 
-def _env_name(env_id: str) -> str:
+def folder_name(env_id: str) -> str:
+    """:return: an environment's id, as folders and files of its runs are named"""
     return env_id.replace("/", "-").replace(":", "-")
 
 

@@ -133,7 +133,7 @@ def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
         normalized = VecNormalize(env, **state)
         for name, saved in statistics.items():
             fresh = getattr(normalized, name, None)
-            if not _same_statistics(saved, fresh):
+            if not _same_layout(saved, fresh):
                 raise UnsafeFileError(f"its {name} are not those of {env.observation_space}")
             setattr(normalized, name, saved)
         return normalized
@@ -599,18 +599,6 @@ def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
     return {"obs_rms": None, "ret_rms": None, **fields, "norm_obs_keys": keys}
 
 
-def _same_statistics(saved: Any, fresh: Any) -> bool:
-    if isinstance(fresh, dict):
-        return (
-            isinstance(saved, dict)
-            and saved.keys() == fresh.keys()
-            and all(_same_statistics(saved[key], fresh[key]) for key in fresh)
-        )
-    if isinstance(fresh, RunningMeanStd):
-        return isinstance(saved, RunningMeanStd) and np.shape(saved.mean) == np.shape(fresh.mean)
-    return saved is None
-
-
 def _arrays_like(buffer: ReplayBuffer) -> Callable[[Call, Rebuild], dict[str, Any]]:
     """Of a replay buffer only its arrays of numbers, its position and its number of environments are looked at."""
     names = [name for name, value in vars(buffer).items() if isinstance(value, dict) or _is_numeric(value)]
@@ -634,6 +622,8 @@ def _same_layout(saved: Any, fresh: Any) -> bool:
             and saved.keys() == fresh.keys()
             and all(_same_layout(saved[key], fresh[key]) for key in fresh)
         )
+    if isinstance(fresh, RunningMeanStd):
+        return isinstance(saved, RunningMeanStd) and np.shape(saved.mean) == np.shape(fresh.mean)
     if isinstance(fresh, np.ndarray):
         return isinstance(saved, np.ndarray) and (saved.shape, saved.dtype) == (fresh.shape, fresh.dtype)
     return type(saved) is type(fresh)

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments
+from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments, plain_arguments
 from sb3_tdc.checkpoint import DEFAULT_FREQ, NotRestoredError
 from sb3_tdc.experiment import ALGORITHMS, Experiment, Outcome, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
@@ -91,7 +91,7 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
     hyperparams = read_hyperparams(args)
 
     folder = RunFolder.create(args.log_folder, args.algo, args.env, args.uuid)
-    folder.write_config(hyperparams.raw, _plain(args))
+    folder.write_config(hyperparams.raw, plain_arguments(vars(args)))
     return _experiment(args, hyperparams, folder)
 
 
@@ -107,7 +107,7 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
     if not (folder.path / folder.env_name / "args.yml").is_file():
         raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
     stored = folder.args
-    for name, value in _plain(argparse.Namespace(**given)).items():
+    for name, value in plain_arguments(given).items():
         if name not in (*_OF_THE_PROCESS, "resume") and value != stored.get(name, value):
             flag = f"--{name.replace('_', '-')}"
             raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {stored[name]}")
@@ -126,11 +126,6 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
 
 # What may differ when a run is resumed
 _OF_THE_PROCESS = ("num_threads", "device", "verbose", "progress")
-
-
-def _plain(args: argparse.Namespace) -> dict[str, Any]:
-    """As they are written to the run folder."""
-    return {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
 
 
 def _experiment(args: argparse.Namespace, hyperparams: Hyperparams, folder: RunFolder) -> Experiment:

@@ -48,6 +48,12 @@ class Stored:
         return self.path.parent / _SHARED / name
 
 
+def stored_steps(folder: Path) -> list[int]:
+    """:return: timesteps of the checkpoints in a folder, intact or not, newest first"""
+    found = [_STEP.fullmatch(path.name) for path in folder.glob("step_*")]
+    return sorted((int(match[1]) for match in found if match), reverse=True)
+
+
 class Store:
     """
     The checkpoints of one run.
@@ -68,8 +74,7 @@ class Store:
 
     def steps(self) -> list[int]:
         """:return: of all that is there, intact or not, newest first"""
-        found = [_STEP.fullmatch(path.name) for path in self.folder.iterdir()]
-        return sorted((int(match[1]) for match in found if match), reverse=True)
+        return stored_steps(self.folder)
 
     def newest(self) -> Stored | None:
         """
