@@ -32,7 +32,7 @@ TARGETS = {
     ("SBX TD3", 2): 1.0,
     ("naive transcription", 2): 6.5,
 }
-OPTIONS = ("packed_replay", "compile_loss", "bfloat16")
+OPTIONS = ("compile_loss", "bfloat16")
 
 
 def make_models(env_id: str) -> dict[str, Any]:

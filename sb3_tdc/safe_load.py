@@ -625,5 +625,6 @@ def _same_layout(saved: Any, fresh: Any) -> bool:
     if isinstance(fresh, RunningMeanStd):
         return isinstance(saved, RunningMeanStd) and np.shape(saved.mean) == np.shape(fresh.mean)
     if isinstance(fresh, np.ndarray):
-        return isinstance(saved, np.ndarray) and (saved.shape, saved.dtype) == (fresh.shape, fresh.dtype)
+        # The fused update keeps observations as float32, whatever SB3 would
+        return isinstance(saved, np.ndarray) and (saved.shape, saved.dtype.kind) == (fresh.shape, fresh.dtype.kind)
     return type(saved) is type(fresh)

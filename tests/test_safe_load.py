@@ -588,6 +588,17 @@ def test_a_replay_buffer_is_that_of_sb3(tmp_path, marker, name):
     assert not marker.exists()
 
 
+def test_observations_of_the_fused_update_load_into_a_fresh_model(tmp_path):
+    """They are float32 there, as its packed rows are, and float64 in a new buffer, as the environment has them."""
+    model = TDC("MlpPolicy", "Hopper-v4", fused=True, policy_kwargs={"net_arch": [8, 8]}, **TINY).learn(60)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    fresh = TDC("MlpPolicy", "Hopper-v4", policy_kwargs={"net_arch": [8, 8]}, **TINY)
+    assert fresh.replay_buffer.observations.dtype == np.float64
+    load_replay_buffer(tmp_path / "buffer.pkl", fresh)
+    assert np.array_equal(fresh.replay_buffer.observations, model.replay_buffer.observations)
+    fresh.learn(60, reset_num_timesteps=False)
+
+
 # -------------------------------------------------------------------- enjoy.py and train.py
 
 

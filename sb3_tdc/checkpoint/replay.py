@@ -2,9 +2,8 @@
 The replay buffer's rings in segments: a checkpoint writes the transitions added since the last one.
 
 A segment holds consecutive slots of the ring. The ring is that of the segments in the order they were written; one
-whose slots have all been overwritten since is not needed any more. Observations keep the type that SB3 stores them in
-(float64 for MuJoCo). A next observation that equals the observation of the following slot, bit for bit, is not stored
-twice.
+whose slots have all been overwritten since is not needed any more. Observations keep the type that the buffer has. A
+next observation that equals the observation of the following slot, bit for bit, is not stored twice.
 """
 
 import json

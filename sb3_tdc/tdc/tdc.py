@@ -74,8 +74,7 @@ class TDC(OffPolicyAlgorithm):
     :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
         observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
     :param fused_kwargs: what it may do besides, each True or False: ``bfloat16`` (products between hidden layers of
-        factors rounded to bfloat16), ``compile_loss`` (the gradient of the loss by ``torch.compile``),
-        ``packed_replay`` (minibatches from a float32 copy of the replay buffer; on CUDA by default)
+        factors rounded to bfloat16), ``compile_loss`` (the gradient of the loss by ``torch.compile``)
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),

@@ -99,7 +99,7 @@ _HER = {"replay_buffer_class": HerReplayBuffer, "learning_starts": 70}
 OTHERS = {
     "readable update": Case("Hopper-v4", kwargs={"fused": False}),
     "VecNormalize": Case("Hopper-v4", n_envs=2, wrap=lambda env: VecNormalize(VecFrameStack(env, 2))),
-    "ring overwritten": Case("Walker2d-v4", kwargs={"buffer_size": 150, "fused_kwargs": {"packed_replay": True}}),
+    "ring overwritten": Case("Walker2d-v4", kwargs={"buffer_size": 150}),
     "ring overwritten, two environments": Case(n_envs=2, kwargs={"buffer_size": 90}),
     "n-step": Case("Hopper-v4", kwargs={"n_steps": 3, "buffer_size": 230}),
     "small memory": Case(

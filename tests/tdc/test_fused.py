@@ -314,7 +314,7 @@ def test_compiled_gradient_of_the_loss(kappa):
 @pytest.mark.parametrize(
     ("kwargs", "reason"),
     [
-        ({"fused_kwargs": {"bf16": True}}, "fused_kwargs may have bfloat16, compile_loss, packed_replay, got 'bf16'"),
+        ({"fused_kwargs": {"bf16": True}}, "fused_kwargs may have bfloat16, compile_loss, got 'bf16'"),
         ({"fused_kwargs": {"bfloat16": 1}}, r"fused_kwargs\['bfloat16'\] must be True or False, got 1"),
         (
             {"fused_kwargs": {"bfloat16": True}, "policy_kwargs": {"activation_fn": nn.Tanh}},

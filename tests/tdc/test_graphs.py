@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.env_util import make_vec_env
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
-from sb3_tdc.tdc.fused.replay import PackedReplay
 from tests.tdc.test_fused import assert_close, states
 from tests.tdc.test_tdc import HEADS, make
 from tests.tdc.test_update import BatchQueue, TwoActions, make_model, random_batches
@@ -110,49 +107,6 @@ def test_a_change_of_what_is_captured_makes_new_graphs():
     bound = model._fused_update
     model.train(gradient_steps=1, batch_size=16)
     assert model._fused_update is bound
-
-
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_packed_replay_returns_what_the_buffer_returns(n_envs):
-    """While it fills, wraps around, and stands full; bit for bit, from the same random numbers."""
-    env, rng = TwoActions(), np.random.default_rng(0)
-    buffer = ReplayBuffer(10 * n_envs, env.observation_space, env.action_space, "cpu", n_envs=n_envs)
-    packed_replay, steps = PackedReplay(buffer, batch_size=20), 0
-    for added in (1, 3, 4, 2, 1, 0, 9, 5, 10, 3, 27):  # full exactly at the fourth
-        for _ in range(added):
-            observation, next_observation = rng.normal(size=(2, n_envs, 3))
-            done = rng.random(n_envs) < 0.5
-            infos = [{"TimeLimit.truncated": bool(rng.random() < 0.5)} for _ in range(n_envs)]
-            action, reward = rng.normal(size=(n_envs, 2)), rng.normal(size=n_envs)
-            buffer.add(observation, next_observation, action, reward, done, infos)
-        steps += added
-        np.random.seed(added)
-        expected = buffer.sample(20)
-        np.random.seed(added)
-        for name, got, want in zip(expected._fields, packed_replay.sample(steps), expected, strict=True):
-            assert got is want is None or th.equal(got, want.float()), (added, name)
-
-
-@HEADS
-def test_learning_from_packed_replay_is_the_same(stochastic_actor):
-    """Two environments, a buffer that wraps around, a second ``learn()``, fewer updates than steps."""
-    models = []
-    for packed_replay in (False, True):
-        env = make_vec_env(TwoActions, n_envs=2, seed=0)
-        kwargs = {"buffer_size": 60, "train_freq": 3, "gradient_steps": 2, "stochastic_actor": stochastic_actor}
-        model = make(env, fused_kwargs={"packed_replay": packed_replay}, **kwargs).learn(150).learn(100)
-        assert (model._fused_update.packed_replay is not None) is packed_replay
-        models.append(model)
-    assert_close(*map(states, models), rtol=0, atol=0)
-
-
-def test_where_packed_replay_applies():
-    model = make()
-    assert PackedReplay.applies(model.replay_buffer)
-    assert not PackedReplay.applies(make(n_steps=3).replay_buffer)
-    replay_buffer_kwargs = {"handle_timeout_termination": False}
-    lean = make(optimize_memory_usage=True, replay_buffer_kwargs=replay_buffer_kwargs)
-    assert not PackedReplay.applies(lean.replay_buffer)
 
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")

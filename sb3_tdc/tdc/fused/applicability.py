@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # What a subclass of TDC may override, and then expects to be called
 _METHODS = ("train", "update_critics", "update_actor", "update_targets", "_sample_target_actions")
-_OPTIONS = ("bfloat16", "compile_loss", "packed_replay")
+_OPTIONS = ("bfloat16", "compile_loss")
 _CLASSES = (TDCPolicy, DeterministicActor, TanhGaussianActor, QuantileCritic)
 
 

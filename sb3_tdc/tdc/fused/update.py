@@ -104,10 +104,9 @@ class FusedUpdate:
         """:return: a minibatch of the model's replay buffer"""
         model = self.model
         buffer, normalization = model.replay_buffer, model._vec_normalize_env
-        packed = model.fused_kwargs.get("packed_replay", model.device.type == "cuda")
-        if not packed or normalization is not None or not PackedReplay.applies(buffer):
+        if normalization is not None or not PackedReplay.applies(buffer):
             return buffer.sample(batch_size, env=normalization)
-        if self.packed_replay is None or self.packed_replay.buffer is not buffer:
+        if self.packed_replay is None or not self.packed_replay.holds(buffer):
             self.packed_replay = PackedReplay(buffer, batch_size)
         return self.packed_replay.sample(model.num_timesteps // model.n_envs)
 
