@@ -3,5 +3,5 @@ try:
     import matplotlib  # noqa: F401
     import pandas  # noqa: F401
     import scipy  # noqa: F401
-except ImportError as error:
-    raise ImportError('The experiments need more packages: pip install "sb3-tdc[report]"') from error
+except ImportError as error:  # these are command lines: a sentence, not a traceback
+    raise SystemExit(f'The experiments need more packages ({error.name}): pip install "sb3-tdc[report]"') from error

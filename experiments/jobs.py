@@ -28,8 +28,7 @@ from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.run_folder import RunFolder, folder_name
 
 ROOT = Path(__file__).resolve().parents[1]
-# How often a process is looked at
-POLL_SECONDS = 0.2
+_POLL_SECONDS = 0.2
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,7 @@ def run(job: Job) -> int:
     process = job.start()
     try:
         while process.poll() is None:
-            time.sleep(POLL_SECONDS)
+            time.sleep(_POLL_SECONDS)
     finally:
         stop([process])
     return process.returncode

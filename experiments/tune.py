@@ -16,15 +16,16 @@ import pandas as pd
 import yaml
 
 from experiments.figures import COLORS, draw_sweep
-from experiments.jobs import POLL_SECONDS, Job, cluster, count_cores, eval_freq, stop
+from experiments.jobs import Job, cluster, count_cores, eval_freq, stop
 from experiments.results import Run
 from experiments.search_space import LAMBDAS, make_candidates, parse_space
-from sb3_tdc.arguments import KeyValues, Parser, one_of, plain_arguments
+from sb3_tdc.arguments import KeyValues, Parser, add_package_argument, import_packages, one_of, plain_arguments
 from sb3_tdc.experiment import ALGORITHMS, check_env_id
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
 from sb3_tdc.run_folder import folder_name
 
 _ARGUMENTS = "search.yml"
+_POLL_SECONDS = 1.0  # a look reads the files of a run, which takes time from the training
 _LONGEST_STEP_SECONDS = 5.0
 
 
@@ -52,7 +53,7 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
                 returns = read_returns(self.jobs)
                 if has_ended or returns.shape[1] > self.n_reported or time.monotonic() > deadline:
                     break
-                time.sleep(POLL_SECONDS)
+                time.sleep(_POLL_SECONDS)
             failed = [job for job in self.jobs if has_ended and not job.is_finished]
             if failed:
                 raise RuntimeError("; ".join(f"{job}: see {job.log}: {' | '.join(job.last_lines())}" for job in failed))
@@ -190,7 +191,8 @@ def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: S
     content = {best.env_id: {**entry, **best.settings}}  # with the steps of a whole training
     (folder / "best.yml").write_text(yaml.safe_dump(content, sort_keys=False))
     print(f"Ranking, figures and the best hyperparameters are in {folder}")
-    print(f"  python train.py --algo {best.algo} --env {best.env_id} -conf {shlex.quote(str(folder / 'best.yml'))}")
+    command = ["python", "train.py", "--algo", best.algo, "--env", best.env_id, "-conf", str(folder / "best.yml")]
+    print("  " + shlex.join([*command, *(["--gym-packages", *best.packages] if best.packages else [])]))
 
 
 # ---------------------------------------------------------------- command line
@@ -213,6 +215,7 @@ def make_parser() -> Parser:
     )
     add("--samples", type=int, default=10, help="draws of the distributions in --search")
     add("-params", "--hyperparams", nargs="+", action=KeyValues, default={}, help="key:value of all candidates")
+    add_package_argument(parser)
     add("--asha", action="store_true", help="stop the worse two thirds of the candidates early, twice")
     add("--logs", type=Path, default=Path("logs"), help="folder of all searches")
     add("--jobs", type=int, help="CPUs to use (default: all cores); a trial takes one, with --asha one a seed")
@@ -249,7 +252,8 @@ def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
 
     def job(number: int, candidate: dict[str, Any], seed: int) -> Job:
         logs = args.folder / f"candidate_{number}" / f"seed_{seed}"
-        return Job(args.algo, args.env, seed, args.n_timesteps, logs, {**args.hyperparams, **candidate})
+        settings, packages = {**args.hyperparams, **candidate}, tuple(args.gym_packages)
+        return Job(args.algo, args.env, seed, args.n_timesteps, logs, settings, packages)
 
     return [
         [job(number, candidate, seed) for seed in range(1, args.seeds + 1)]
@@ -269,18 +273,21 @@ def _check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
             raise ValueError(f"--search and -params: {' '.join(str(error).split())}") from error
 
 
-def make_trials(candidates: Sequence[Sequence[Job]], side_by_side: bool) -> dict[str, Sequence[Job]]:
+def make_trials(
+    candidates: Sequence[Sequence[Job]], searched: Sequence[str], side_by_side: bool
+) -> dict[str, Sequence[Job]]:
     """
+    :param searched: names of hyperparameters; their values name the trials
     :param side_by_side: all seeds of a candidate in one trial: what stops a trial then stops a candidate, not its bad
         seeds, which would leave a mean of the lucky ones
     """
+
+    def name(job: Job, seeds: str) -> str:
+        return ", ".join([*(f"{key} {job.settings[key]}" for key in searched), seeds])
+
     if not side_by_side:
-        return {_name(job.settings, f"seed {job.seed}"): [job] for jobs in candidates for job in jobs}
-    return {_name(jobs[0].settings, f"{len(jobs)} seeds"): jobs for jobs in candidates}
-
-
-def _name(settings: dict[str, Any], seeds: str) -> str:
-    return ", ".join([*(f"{key} {value}" for key, value in settings.items()), seeds])
+        return {name(job, f"seed {job.seed}"): [job] for jobs in candidates for job in jobs}
+    return {name(jobs[0], f"{len(jobs)} seeds"): jobs for jobs in candidates}
 
 
 def _read_arguments(args: argparse.Namespace, given: dict[str, Any]) -> None:
@@ -320,10 +327,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if args.resume is not None:
             _read_arguments(args, given)
-        else:
+        args.env = import_packages(args, args.env)
+        if args.resume is None:
             args.folder = _make_folder(args)
         candidates = make_candidate_jobs(args)
-        trials = make_trials(candidates, args.asha)
+        trials = make_trials(candidates, args.searched, args.asha)
         with cluster(args.address, args.jobs):
             if args.resume is None:
                 args.folder.mkdir(parents=True)

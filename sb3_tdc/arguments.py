@@ -73,13 +73,18 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
     return check
 
 
+def add_package_argument(parser: Parser) -> None:
+    """For :func:`import_packages`."""
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
+
+
 def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:
     """The flags that training and enjoying share, as in RL Zoo."""
     parser.add_argument("--algo", type=one_of("algorithm", algorithms), default="tdc", help="algorithm")
     parser.add_argument("-f", "--log-folder", "--folder", default="logs", help="folder of all runs")
     parser.add_argument("--num-threads", type=int, default=-1, help="threads for PyTorch (-1: two, if there are)")
     parser.add_argument("--device", default="auto", help="PyTorch device (cpu, cuda, ...)")
-    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
+    add_package_argument(parser)
     parser.add_argument("--env-kwargs", nargs="+", action=KeyValues, default={}, help="key:value of the environment")
 
 
@@ -88,9 +93,9 @@ def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {name: str(value) if isinstance(value, Path) else value for name, value in arguments.items()}
 
 
-def apply_common_arguments(args: argparse.Namespace, env_id: str) -> str:
+def import_packages(args: argparse.Namespace, env_id: str) -> str:
     """
-    Import the packages that register environments, and set the number of threads.
+    Import the packages of ``--gym-packages``, which register environments.
 
     :param env_id: perhaps with its package, as in "package:Env-v0", which is then one of the packages
     :return: the environment's id alone
@@ -106,6 +111,18 @@ def apply_common_arguments(args: argparse.Namespace, env_id: str) -> str:
             raise ValueError(
                 f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}"
             ) from error
+    return env_id
+
+
+def apply_common_arguments(args: argparse.Namespace, env_id: str) -> str:
+    """
+    :func:`import_packages`, and set the number of threads.
+
+    :param env_id: perhaps with its package
+    :return: the environment's id alone
+    :raises ValueError: for a package that is not installed
+    """
+    env_id = import_packages(args, env_id)
     if args.num_threads > 0:
         th.set_num_threads(args.num_threads)
     elif "OMP_NUM_THREADS" not in os.environ:  # networks of this size gain nothing from more

@@ -80,9 +80,11 @@ def test_ranking_by_hand(tmp_path):
 
 
 def test_trials(tmp_path):
-    candidates = [[Job("tdc", "Hopper-v4", seed, 10, tmp_path, {"lam": lam}) for seed in (1, 2)] for lam in (0.0, 1.0)]
-    assert list(map(len, tune.make_trials(candidates, side_by_side=False).values())) == [1] * 4
-    assert tune.make_trials(candidates, side_by_side=True) == {
+    candidates = [
+        [Job("tdc", "Hopper-v4", seed, 10, tmp_path, {"tau": 0.1, "lam": lam}) for seed in (1, 2)] for lam in (0.0, 1.0)
+    ]
+    assert list(map(len, tune.make_trials(candidates, ["lam"], side_by_side=False).values())) == [1] * 4
+    assert tune.make_trials(candidates, ["lam"], side_by_side=True) == {
         "lam 0.0, 2 seeds": candidates[0],
         "lam 1.0, 2 seeds": candidates[1],
     }
@@ -97,6 +99,7 @@ def test_trials(tmp_path):
         (["--search", "lamm:[1.0]"], "did you mean 'lam'"),
         (["--search", "lam:[high]"], "lam must be"),
         (["--search", "lam:[-1.0]"], "lam must be"),
+        (["--gym-packages", "no_such_package"], "pip install no_such_package"),
         (["-n", "0"], "-n must be at least 1"),
         (["--seeds", "0"], "--seeds must be at least 1"),
         (["--asha", "--seeds", "3", "--jobs", "2"], "3 seeds need as many CPUs"),
