@@ -183,19 +183,6 @@ def is_running(pid):
 
 
 @pytest.mark.slow
-def test_a_failing_run_does_not_stop_the_rest_and_finished_ones_are_skipped(tmp_path):
-    out, status = finish(start("fig2", tmp_path, "--scale", "0.0003"))
-    assert status == 1, out
-    assert "failed tdc Pendulum-v1" in out
-    assert "lam must be" in out
-    runs, _ = find_runs(tmp_path)
-    assert [r.is_finished for r in runs] == [True]
-    out, status = finish(start("fig2", tmp_path, "--scale", "0.0003"))
-    assert status == 1, out
-    assert "1 of 2 runs are finished already" in out
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_matrix_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
     scale = ["--scale", "0.003", "--jobs", "2"]  # 3,000 steps

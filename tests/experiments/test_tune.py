@@ -66,7 +66,7 @@ def test_ranking_by_hand(tmp_path):
     candidates = [
         make_candidate(tmp_path, 0.1, [[1, 3], [3, 5]]),  # means 2 and 4
         make_candidate(tmp_path, 0.2, [[4, 6], [5, 7]]),  # 5 and 6
-        make_candidate(tmp_path, 0.3, [[9, 9], [9]]),  # stopped after one evaluation of both
+        make_candidate(tmp_path, 0.3, [[9, 1], [9]]),  # both have one evaluation
     ]
     table = tune.rank(candidates, ["lam"])
     assert table["lam"].tolist() == [0.2, 0.1, 0.3]
