@@ -29,8 +29,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_tdc import TDC, UnsafeFileError, enjoy, load_safely
-from sb3_tdc.inert_pickle import read_pickle
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer
+from sb3_tdc.safe_load.inert_pickle import read_pickle
 from tests.test_command_line import SMALL, run_enjoy, run_train
 
 TINY = {"learning_starts": 10, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 
-from sb3_tdc.inert_pickle import Call, Name, Rebuild, UnsafeFileError
+from sb3_tdc.safe_load.inert_pickle import Call, Name, Rebuild, UnsafeFileError
 from sb3_tdc.tdc.checks import check_integer, check_number
 
 MAX_DIMENSIONS = 8

@@ -1,0 +1,57 @@
+"""Zip files, bounded before they are read."""
+
+import io
+import re
+import zipfile
+from typing import IO
+
+from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
+
+MAX_BYTES = 2**30  # of a file, and of what it decompresses to
+MAX_RATIO = 100  # of decompressed to compressed; SB3 itself does not compress
+MAX_DIRECTORY = 2**20  # bytes of a zip's list of entries
+
+MODEL_ENTRIES = re.compile(
+    r"data|_stable_baselines3_version|system_info\.txt|pytorch_variables\.pth|tensors\.pth|policy\.pth"
+    r"|(actor|critic)\.optimizer\.pth|ent_coef_optimizer\.pth"
+)
+
+
+def read_archive(file: IO[bytes], allowed: re.Pattern) -> dict[str, bytes]:
+    """
+    :param allowed: what entries may be called
+    :return: the bytes of each entry
+    :raises UnsafeFileError: for other, repeated, encrypted, oversized or suspiciously compressed entries, unread
+    """
+    if _directory_size(file) > MAX_DIRECTORY:
+        raise UnsafeFileError("it is a zip of too many entries")
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        names = [entry.filename for entry in entries]
+        for entry in entries:
+            if not allowed.fullmatch(entry.filename) or names.count(entry.filename) > 1:
+                raise UnsafeFileError(f"its entry {entry.filename[:100]!r} is unknown or repeated")
+            if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise UnsafeFileError(f"its entry {entry.filename!r} is encrypted, or compressed in an unknown way")
+            if entry.file_size > MAX_RATIO * max(entry.compress_size, 100):
+                raise UnsafeFileError(f"its entry {entry.filename!r} is compressed more than {MAX_RATIO}-fold")
+        if sum(entry.file_size for entry in entries) > MAX_BYTES:
+            raise UnsafeFileError(f"it holds more than {MAX_BYTES:,} bytes")
+        return {entry.filename: archive.read(entry) for entry in entries}
+
+
+def _directory_size(file: IO[bytes]) -> int:
+    """The size of a zip's list of entries, which ``ZipFile`` would read whole; from the records at its end alone."""
+    size = file.seek(0, io.SEEK_END)
+    if size > MAX_BYTES:
+        raise UnsafeFileError(f"it has {size:,} bytes, more than {MAX_BYTES:,}")
+    file.seek(max(size - 98, 0))
+    tail = file.read().rjust(98, b"\0")
+    zip64, locator, end = tail[:56], tail[56:76], tail[76:]
+    if end[:4] != b"PK\5\6" or end[20:] != b"\0\0":
+        raise UnsafeFileError("it is not a zip, or is truncated")
+    if locator[:4] != b"PK\6\7":
+        return int.from_bytes(end[12:16], "little")
+    if zip64[:4] != b"PK\6\6" or int.from_bytes(locator[8:16], "little") != size - 98:
+        raise UnsafeFileError("it is a damaged zip")
+    return int.from_bytes(zip64[40:48], "little")

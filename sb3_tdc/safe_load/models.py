@@ -1,0 +1,124 @@
+"""Saved models."""
+
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
+from sb3_tdc.safe_load.checks import reading
+from sb3_tdc.safe_load.fields import check_replay_memory, known_policies, nearest_algorithm, parse_data, read_fields
+from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
+from sb3_tdc.safe_load.weights import check_optimizer, check_weights, read_tensors
+
+
+def load_safely(
+    path: str | Path,
+    env: GymEnv | None = None,
+    device: th.device | str = "auto",
+    custom_objects: dict[str, Any] | None = None,
+    algorithm: type[OffPolicyAlgorithm] | None = None,
+    **kwargs: Any,
+) -> OffPolicyAlgorithm:
+    """
+    What ``Algorithm.load`` does for TDC, TD3, SAC, DDPG and TQC, without running anything that is in the file.
+
+    The model predicts and goes on learning as the saved one. It differs in this: ``tensorboard_log`` is never the
+    file's, the last observation and the statistics of the last episodes are not kept (an environment is reset when
+    learning begins), and a schedule or a class of your own is refused unless ``custom_objects`` replaces it.
+
+    :param path: zip of a saved model, with or without its suffix
+    :param env: the environment to run it on; None to only predict
+    :param device: PyTorch device
+    :param custom_objects: what to take for fields of the file, by name, which are then not looked at
+    :param algorithm: the class to make; None: by the file's policy (for DDPG, which has TD3's policies, TD3)
+    :param kwargs: attributes to set over the file's, for instance ``buffer_size=1``
+    :raises UnsafeFileError: (a ``ValueError``) if the file is refused or damaged, in one sentence that names the field
+    :raises ValueError: if it is of another algorithm, or of an environment with other spaces
+    """
+    path = Path(path)
+    if not path.exists() and path.with_name(f"{path.name}.zip").is_file():
+        path = path.with_name(f"{path.name}.zip")
+    with reading(f"{path} was not opened"):
+        with path.open("rb") as file:
+            entries = read_archive(file, MODEL_ENTRIES)
+        for required in ("data", "policy.pth"):
+            if required not in entries:
+                raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
+        fields = read_fields(entries["data"], {**kwargs, **(custom_objects or {})})
+        policy_class = fields.pop("policy_class", None)
+        saved_by = known_policies().get(policy_class) or nearest_algorithm(policy_class)
+        fields.update(kwargs)
+        if saved_by is None:
+            raise UnsafeFileError("it has no policy_class of TDC, TD3, SAC, DDPG or TQC")
+        if algorithm is not None and not issubclass(algorithm, saved_by):
+            raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
+        algorithm = algorithm or saved_by
+        tensors = {}
+        for name in (name for name in entries if name.endswith(".pth")):
+            with reading(name):
+                tensors[name.removesuffix(".pth")] = read_tensors(entries[name], device)
+
+    if env is not None:
+        env = algorithm._wrap_env(env, fields.get("verbose", 0))
+        for name in ("observation_space", "action_space"):
+            fields.setdefault(name, getattr(env, name))
+        check_for_correct_spaces(env, fields["observation_space"], fields["action_space"])
+        fields["n_envs"] = env.num_envs
+    with reading(f"{path} was not opened"):
+        for name in ("observation_space", "action_space"):
+            if name not in fields:
+                raise UnsafeFileError(f"it has no {name}: give env")
+        check_replay_memory(fields)
+        check_weights(policy_class, fields, tensors["policy"])
+        return _make_model(algorithm, policy_class, env, device, fields, tensors)
+
+
+def read_data(path: str | Path) -> dict[str, Any]:
+    """
+    :return: the JSON of a saved model, as it stands there: nothing in it is checked, rebuilt or run
+    :raises UnsafeFileError: if it is not the zip of a saved model
+    """
+    with reading(f"{path} is not the zip of a saved model"):
+        with Path(path).open("rb") as file:
+            return parse_data(read_archive(file, MODEL_ENTRIES)["data"])
+
+
+def _make_model(
+    algorithm: type[OffPolicyAlgorithm],
+    policy_class: type[BasePolicy],
+    env: VecEnv | None,
+    device: th.device | str,
+    fields: dict[str, Any],
+    tensors: dict[str, Any],
+) -> OffPolicyAlgorithm:
+    model: Any = algorithm(policy_class, env, device=device, _init_setup_model=False)  # type: ignore[arg-type,call-arg]
+    vars(model).update(fields)
+    model._setup_model()
+    state_dicts, variables = model._get_torch_save_params()
+    saved_variables = {**tensors.pop("tensors", {}), **tensors.pop("pytorch_variables", {})}
+    for name in state_dicts:
+        if name.endswith("optimizer"):
+            with reading(f"{name}.pth"):
+                optimizer = model
+                for attribute in name.split("."):
+                    optimizer = getattr(optimizer, attribute)
+                check_optimizer(optimizer, tensors[name])
+    model.set_parameters(tensors, exact_match=True, device=device)
+    for name, value in saved_variables.items():
+        with reading(f"pytorch_variables.pth, {str(name)[:100]}"):
+            if name not in variables:
+                raise UnsafeFileError("it is unknown")
+            if value is not None:
+                current = getattr(model, name)
+                if value.shape != current.shape or not value.isfinite().all():
+                    raise UnsafeFileError("it is of another shape, or not finite")
+                current.data = value.data.to(current.device, current.dtype)
+    if model.use_sde:
+        model.policy.reset_noise()
+    return model

@@ -1,0 +1,119 @@
+"""What lies pickled beside a model: normalisation statistics and replay buffers."""
+
+import mmap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_tdc.safe_load.checks import boolean, integer, reading
+from sb3_tdc.safe_load.fields import MAX_ENVS, MAX_REPLAY_BYTES
+from sb3_tdc.safe_load.inert_pickle import Call, Rebuild, UnsafeFileError, read_pickle, rebuild
+from sb3_tdc.safe_load.known_objects import CALLS, name_of
+from sb3_tdc.tdc.checks import check_number
+
+
+def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
+    """
+    What ``VecNormalize.load`` does, without running anything that is in the file.
+
+    :param path: statistics as SB3 and RL Zoo save them (``vecnormalize.pkl``)
+    :param env: the environment to normalise
+    :raises UnsafeFileError: if the file is refused or damaged, or is of other observations
+    """
+    with reading(f"{path} was not opened"):
+        state = _read_object(path, VecNormalize, _normalization_state)
+        statistics = {name: state.pop(name) for name in ("obs_rms", "ret_rms")}
+        normalized = VecNormalize(env, **state)
+        for name, saved in statistics.items():
+            fresh = getattr(normalized, name, None)
+            if not _same_layout(saved, fresh):
+                raise UnsafeFileError(f"its {name} are not those of {env.observation_space}")
+            setattr(normalized, name, saved)
+        return normalized
+
+
+def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
+    """
+    What ``model.load_replay_buffer`` does, without running anything that is in the file.
+
+    :param path: a replay buffer as SB3 saves it, of the same class, size and number of environments as the model's
+    :raises UnsafeFileError: if the file is refused or damaged, or is not such a replay buffer
+    """
+    buffer = model.replay_buffer
+    assert buffer is not None
+    with reading(f"{path} was not opened"):
+        saved = _read_object(path, type(buffer), _arrays_like(buffer))
+        if saved["n_envs"] != buffer.n_envs:
+            raise UnsafeFileError(f"it is of {saved['n_envs']} environments, this run has {buffer.n_envs}")
+        for name, fresh in vars(buffer).items():
+            if name in saved and not _same_layout(saved[name], fresh):
+                raise UnsafeFileError(f"its {name} are not those of this run (buffer_size, observations, actions)")
+        if not 0 <= saved["pos"] < buffer.buffer_size:
+            raise UnsafeFileError(f"its position, {saved['pos']}, is outside")
+        vars(buffer).update(saved)
+        if isinstance(buffer, HerReplayBuffer):
+            buffer.truncate_last_trajectory()
+
+
+def _read_object(path: str | Path, cls: type, read_state: Callable[[Call, Rebuild], dict[str, Any]]) -> dict[str, Any]:
+    """:return: what ``read_state`` takes from the one pickled object of a class that a file holds"""
+    size = Path(path).stat().st_size
+    if size > MAX_REPLAY_BYTES:
+        raise UnsafeFileError(f"it has {size:,} bytes, more than {MAX_REPLAY_BYTES:,}")
+    with Path(path).open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        saved = read_pickle(content)  # type: ignore[arg-type]  # a mapped file reads like a file
+    if not isinstance(saved, Call) or saved.function != name_of(cls):
+        raise UnsafeFileError(f"it does not hold a {cls.__name__}")
+    return rebuild(saved, {}, {**CALLS, name_of(cls): read_state})
+
+
+def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
+    """The keyword arguments of ``VecNormalize``, and its statistics; nothing else of the pickle is looked at."""
+    state = call.state
+    fields: dict[str, Any] = {name: make(state[name]) for name in ("obs_rms", "ret_rms") if name in state}
+    for name in ("training", "norm_obs", "norm_reward"):
+        fields[name] = boolean(name, make(state[name]))
+    for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
+        fields[name] = check_number(name, make(state[name]), 0.0)
+    keys = make(state.get("norm_obs_keys"))
+    if keys is not None and not (isinstance(keys, list) and all(isinstance(key, str) for key in keys)):
+        raise UnsafeFileError("norm_obs_keys that are not names")
+    return {"obs_rms": None, "ret_rms": None, **fields, "norm_obs_keys": keys}
+
+
+def _arrays_like(buffer: ReplayBuffer) -> Callable[[Call, Rebuild], dict[str, Any]]:
+    """Of a replay buffer only its arrays of numbers, its position and its number of environments are looked at."""
+    names = [name for name, value in vars(buffer).items() if isinstance(value, dict) or _is_numeric(value)]
+
+    def read_state(call: Call, make: Rebuild) -> dict[str, Any]:
+        position = {"pos": integer(0)("pos", make(call.state["pos"])), "full": boolean("full", call.state["full"])}
+        n_envs = integer(1, MAX_ENVS)("n_envs", make(call.state["n_envs"]))
+        return {**position, "n_envs": n_envs, **{name: make(call.state[name]) for name in names if name != "infos"}}
+
+    return read_state
+
+
+def _is_numeric(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+
+
+def _same_layout(saved: Any, fresh: Any) -> bool:
+    if isinstance(fresh, dict):
+        return (
+            isinstance(saved, dict)
+            and saved.keys() == fresh.keys()
+            and all(_same_layout(saved[key], fresh[key]) for key in fresh)
+        )
+    if isinstance(fresh, RunningMeanStd):
+        return isinstance(saved, RunningMeanStd) and np.shape(saved.mean) == np.shape(fresh.mean)
+    if isinstance(fresh, np.ndarray):
+        # The fused update keeps observations as float32, whatever SB3 would
+        return isinstance(saved, np.ndarray) and (saved.shape, saved.dtype.kind) == (fresh.shape, fresh.dtype.kind)
+    return type(saved) is type(fresh)
