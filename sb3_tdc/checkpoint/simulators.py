@@ -8,6 +8,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+from sb3_tdc.checkpoint import kinds  # noqa: F401  # these come before its own
 from sb3_tdc.checkpoint.codec import (
     MISSING,
     Capture,

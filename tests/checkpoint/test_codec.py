@@ -18,7 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sb3_tdc.checkpoint.codec import MISSING, Capture, NotCapturedError, NotRestoredError, Restore, run_lengths
+from sb3_tdc.checkpoint.codec import MISSING, Capture, NotCapturedError, NotRestoredError, Restore
+from sb3_tdc.checkpoint.kinds import run_lengths
 
 
 class Colour(enum.Enum):
