@@ -83,11 +83,12 @@ def make_candidates(space: Mapping[str, list[Any] | Distribution], n_samples: in
     """
     Every combination of the lists, each with every one of ``n_samples`` joint draws of the distributions.
 
-    :return: the same for the same arguments
+    :return: each once; the same for the same arguments
     """
     lists = {key: values for key, values in space.items() if isinstance(values, list)}
     drawn = {key: values for key, values in space.items() if isinstance(values, Distribution)}
     random = np.random.default_rng(seed)
     draws = [{key: d.draw(random) for key, d in drawn.items()} for _ in range(n_samples if drawn else 1)]
     combinations = [dict(zip(lists, values, strict=True)) for values in itertools.product(*lists.values())]
-    return [{key: {**c, **draw}[key] for key in space} for c in combinations for draw in draws]
+    candidates = [{key: {**c, **draw}[key] for key in space} for c in combinations for draw in draws]
+    return [candidate for i, candidate in enumerate(candidates) if candidate not in candidates[:i]]

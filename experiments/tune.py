@@ -327,6 +327,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if args.resume is not None:
             _read_arguments(args, given)
+        typed = plain_arguments(vars(args))
         args.env = import_packages(args, args.env)
         if args.resume is None:
             args.folder = _make_folder(args)
@@ -335,8 +336,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with cluster(args.address, args.jobs):
             if args.resume is None:
                 args.folder.mkdir(parents=True)
-                stored = plain_arguments({key: value for key, value in vars(args).items() if key != "searched"})
-                (args.folder / _ARGUMENTS).write_text(yaml.safe_dump(stored))
+                (args.folder / _ARGUMENTS).write_text(yaml.safe_dump(typed))
             print(
                 f"{len(candidates)} candidates × {args.seeds} seeds, {args.n_timesteps:,} steps each, evaluated every "
                 f"{eval_freq(args.n_timesteps):,} (5 episodes); one CPU and one thread a seed; in {args.folder}",

@@ -597,6 +597,13 @@ def test_observations_of_the_fused_update_load_into_a_fresh_model(tmp_path):
     load_replay_buffer(tmp_path / "buffer.pkl", fresh)
     assert np.array_equal(fresh.replay_buffer.observations, model.replay_buffer.observations)
     fresh.learn(60, reset_num_timesteps=False)
+    load_replay_buffer(tmp_path / "buffer.pkl", model)
+    for dtype in (np.float16, np.int8):
+        other = TDC("MlpPolicy", "Hopper-v4", policy_kwargs={"net_arch": [8, 8]}, **TINY)
+        other.replay_buffer.rewards = other.replay_buffer.rewards.astype(dtype)
+        other.save_replay_buffer(tmp_path / "other.pkl")
+        with pytest.raises(UnsafeFileError, match="rewards are not those of this run"):
+            load_replay_buffer(tmp_path / "other.pkl", fresh)
 
 
 # -------------------------------------------------------------------- enjoy.py and train.py

@@ -22,7 +22,7 @@ def reading(what: str) -> Iterator[None]:
 
 
 def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
-    """:return: a check of a field, by its name, that gives its value or raises ``ValueError``"""
+    """:return: a check of a field, as :func:`boolean` is one"""
 
     def check(name: str, value: Any) -> int:
         if check_integer(name, value, minimum) > maximum:
@@ -33,7 +33,12 @@ def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
 
 
 def boolean(name: str, value: Any) -> bool:
-    """Such a check."""
+    """
+    A check of a field.
+
+    :return: the value
+    :raises ValueError: unless it is True or False
+    """
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be true or false, got {value!r:.100}")
     return value

@@ -114,6 +114,10 @@ def _same_layout(saved: Any, fresh: Any) -> bool:
     if isinstance(fresh, RunningMeanStd):
         return isinstance(saved, RunningMeanStd) and np.shape(saved.mean) == np.shape(fresh.mean)
     if isinstance(fresh, np.ndarray):
-        # The fused update keeps observations as float32, whatever SB3 would
-        return isinstance(saved, np.ndarray) and (saved.shape, saved.dtype.kind) == (fresh.shape, fresh.dtype.kind)
+        return isinstance(saved, np.ndarray) and saved.shape == fresh.shape and _same_type(saved.dtype, fresh.dtype)
     return type(saved) is type(fresh)
+
+
+def _same_type(saved: np.dtype, fresh: np.dtype) -> bool:
+    # The fused update keeps observations as float32 where SB3 has float64
+    return saved == fresh or {saved, fresh} == {np.dtype(np.float32), np.dtype(np.float64)}

@@ -333,7 +333,7 @@ class TDC(OffPolicyAlgorithm):
             return None
         self._obstacles = obstacles(self)  # again: optimizers and networks can be replaced by their owner
         if not self._obstacles:
-            self._fused_update = FusedUpdate(self, batch_size)
+            self._fused_update = FusedUpdate(self, batch_size, bound.packed_replay if bound is not None else None)
         elif self.fused:
             raise ValueError(self._obstacle_message())
         return self._fused_update

@@ -35,6 +35,8 @@ def test_space():
     assert all(1e-4 <= c["tau"] <= 1e-2 and c["policy_delay"] in (1, 2, 3) for c in candidates)
     assert make_candidates(space, 4) == candidates
     assert make_candidates({"lam": [0.5]}, 99) == [{"lam": 0.5}]
+    few = make_candidates({"policy_delay": Distribution("randint", 1, 3)}, 30)
+    assert sorted(c["policy_delay"] for c in few) == [1, 2, 3]
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_returns_what_the_buffer_returns(n_envs, mirrored, kwargs):
     plain, packed = make_buffer(n_envs, **kwargs), make_buffer(n_envs, **kwargs)
     rng = np.random.default_rng(0)
     add_steps([plain, packed], 3, rng)
-    packed_replay, steps = PackedReplay(packed, batch_size=20), 3
+    packed_replay, steps = PackedReplay(packed), 3
     if mirrored:
         packed_replay.rows = packed_replay.host_rows.clone()
     for added in (0, 1, 4, 2, 1, 0, 9, 5, 10, 3, 27):  # full exactly at the fourth
@@ -51,7 +51,7 @@ def test_returns_what_the_buffer_returns(n_envs, mirrored, kwargs):
         np.random.seed(added)
         expected = plain.sample(20)
         np.random.seed(added)
-        samples = packed_replay.sample(steps)
+        samples = packed_replay.sample(20, steps)
         for name, got, want in zip(expected._fields, samples, expected, strict=True):
             assert got is want is None or th.equal(got, want.float()), (added, name)
         np.random.seed(added)  # the buffer itself goes on working
@@ -63,17 +63,19 @@ def test_the_arrays_of_the_buffer_are_the_rows():
     """So that what is changed by hand counts, and what is saved is all; other arrays there are noticed."""
     buffer = make_buffer()
     add_steps([buffer], 5, np.random.default_rng(0))
-    packed_replay = PackedReplay(buffer, batch_size=20)
+    packed_replay = PackedReplay(buffer)
     buffer.rewards[:] = 7
     buffer.dones[:], buffer.timeouts[:] = 1, 0
-    samples = packed_replay.sample(5)
+    samples = packed_replay.sample(20, 5)
     assert (samples.rewards == 7).all()
     assert (samples.dones == 1).all()
     copy = pickle.loads(pickle.dumps(buffer))
     assert np.array_equal(copy.observations, buffer.observations)
-    assert len(pickle.dumps(buffer)) < 2000 + sum(array.nbytes for array in packed_replay.arrays.values())
+    assert len(pickle.dumps(buffer)) < 2000 + packed_replay.slots.nbytes
     assert packed_replay.holds(buffer)
     assert not packed_replay.holds(copy)
+    both = pickle.loads(pickle.dumps(packed_replay))  # of which the buffer's arrays are not views any more
+    assert not both.holds(both.buffer)
     buffer.rewards = buffer.rewards.copy()
     assert not packed_replay.holds(buffer)
 
@@ -101,6 +103,9 @@ def test_saving_and_loading_packs_again(tmp_path):
     model.load_replay_buffer(tmp_path / "buffer.pkl")
     assert np.array_equal(before.observations, model.replay_buffer.observations)
     model.learn(60)
+    packed_replay = model._fused_update.packed_replay
+    model.train(gradient_steps=1, batch_size=8)  # another update, the same rows
+    assert model._fused_update.packed_replay is packed_replay
     assert model._fused_update.packed_replay.holds(model.replay_buffer)
 
 
@@ -110,6 +115,9 @@ def test_where_it_applies():
     replay_buffer_kwargs = {"handle_timeout_termination": False}
     lean = make(optimize_memory_usage=True, replay_buffer_kwargs=replay_buffer_kwargs)
     assert not PackedReplay.applies(lean.replay_buffer)
+    own = make()
+    own.replay_buffer.sample = own.replay_buffer.sample
+    assert not PackedReplay.applies(own.replay_buffer)
     integers = gym.spaces.Box(0, 255, (3,), np.int64)  # float32 cannot hold them all
     assert not PackedReplay.applies(ReplayBuffer(10, integers, TwoActions().action_space, "cpu"))
     normalized = make(VecNormalize(make_vec_env("Pendulum-v1")), fused=True).learn(60)

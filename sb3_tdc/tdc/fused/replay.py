@@ -18,37 +18,35 @@ class PackedReplay:
     what is changed in the buffer afterwards is not seen.
 
     :param buffer: for which :meth:`applies`
-    :param batch_size: B
     """
 
-    def __init__(self, buffer: ReplayBuffer, batch_size: int):
+    def __init__(self, buffer: ReplayBuffer):
         self.buffer = buffer
         obs_dim, action_dim = buffer.observations.shape[-1], buffer.action_dim
-        widths = [obs_dim, action_dim, obs_dim, 1, 1, 1]
-        slots = np.zeros((buffer.buffer_size, buffer.n_envs, sum(widths)), dtype=np.float32)
-        columns = np.split(slots, np.cumsum(widths)[:-1], axis=-1)
-        self.arrays = {name: self._move(name, part) for name, part in zip(_ARRAYS, columns, strict=True)}
-        self.host_rows = th.from_numpy(slots.reshape(-1, sum(widths)))
+        self.widths = [obs_dim, action_dim, obs_dim, 1, 1, 1]
+        self.slots = np.zeros((buffer.buffer_size, buffer.n_envs, sum(self.widths)), dtype=np.float32)
+        columns = np.split(self.slots, np.cumsum(self.widths)[:-1], axis=-1)
+        for name, part in zip(_ARRAYS, columns, strict=True):
+            self._move(name, part)
+        self.host_rows = th.from_numpy(self.slots.reshape(-1, sum(self.widths)))
         self.rows = self.host_rows.to(buffer.device)
-        self.batch = self.rows.new_empty(batch_size, sum(widths))
-        self.columns = self.batch.split(widths, dim=1)
         self.pos = 0
         self.steps: int | None = None  # when the rows were copied last
 
-    def _move(self, name: str, part: np.ndarray) -> np.ndarray:
+    def _move(self, name: str, part: np.ndarray) -> None:
         """Let an array of the buffer be this part of the rows."""
         array = getattr(self.buffer, name)
         part = part if array.ndim == part.ndim else part[..., 0]
         filled = slice(0, self.buffer.size())
         part[filled] = array[filled]
         setattr(self.buffer, name, part)
-        return part
 
     @staticmethod
     def applies(buffer: ReplayBuffer) -> bool:
         """:return: whether ``sample`` of this buffer is SB3's plain one, of flat observations of real numbers"""
         return (
             type(buffer) is ReplayBuffer
+            and not {"sample", "_get_samples"} & vars(buffer).keys()
             and not buffer.optimize_memory_usage
             and buffer.observations.ndim == 3
             and buffer.observations.dtype.kind == buffer.actions.dtype.kind == "f"
@@ -56,21 +54,22 @@ class PackedReplay:
 
     def holds(self, buffer: ReplayBuffer) -> bool:
         """:return: whether this is the buffer, and its arrays are still parts of the rows"""
-        return self.buffer is buffer and all(getattr(buffer, name) is array for name, array in self.arrays.items())
+        return self.buffer is buffer and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)
 
-    def sample(self, steps: int) -> ReplayBufferSamples:
+    def sample(self, batch_size: int, steps: int) -> ReplayBufferSamples:
         """
+        :param batch_size: B
         :param steps: count of steps of the environments, one for all of them
-        :return: what ``buffer.sample`` would, from the same random numbers; overwritten by the next call
+        :return: what ``buffer.sample`` would, from the same random numbers
         """
         buffer = self.buffer
         if self.rows is not self.host_rows:
             self._copy_new_rows(steps)
-        slots = np.random.randint(0, buffer.size(), size=len(self.batch))
-        envs = np.random.randint(0, high=buffer.n_envs, size=(len(self.batch),))
-        indices = th.from_numpy(slots * buffer.n_envs + envs)
-        th.index_select(self.rows, 0, indices.to(self.rows.device, non_blocking=True), out=self.batch)
-        observations, actions, next_observations, rewards, dones, timeouts = self.columns
+        slots = np.random.randint(0, buffer.size(), size=batch_size)
+        envs = np.random.randint(0, high=buffer.n_envs, size=(batch_size,))
+        indices = th.from_numpy(slots * buffer.n_envs + envs).to(self.rows.device, non_blocking=True)
+        batch = self.rows.index_select(0, indices)
+        observations, actions, next_observations, rewards, dones, timeouts = batch.split(self.widths, dim=1)
         terminated = dones.addcmul_(dones, timeouts, value=-1)
         return ReplayBufferSamples(observations, actions, next_observations, terminated, rewards)
 

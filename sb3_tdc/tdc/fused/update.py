@@ -31,16 +31,17 @@ class FusedUpdate:
 
     :param model: for which :func:`obstacles` found nothing; its parameters become views
     :param batch_size: B
+    :param packed_replay: of an update before this one; it counts where it still holds the model's replay buffer
     """
 
-    def __init__(self, model: "TDC", batch_size: int):
+    def __init__(self, model: "TDC", batch_size: int, packed_replay: PackedReplay | None = None):
         self.model, self.batch_size = model, batch_size
         self.modules = list(model.policy.modules())
         self.critic_adam = FlatAdam(model.critic, model.critic_target)
         self.actor_adam = FlatAdam(model.actor, model.actor_target)
         self.constants = self._read_constants()
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
-        self.packed_replay: PackedReplay | None = None
+        self.packed_replay = packed_replay
         obs_dim = model.policy.actor.features_dim
         action_dim = get_action_dim(model.critic.action_space)
 
@@ -107,8 +108,8 @@ class FusedUpdate:
         if normalization is not None or not PackedReplay.applies(buffer):
             return buffer.sample(batch_size, env=normalization)
         if self.packed_replay is None or not self.packed_replay.holds(buffer):
-            self.packed_replay = PackedReplay(buffer, batch_size)
-        return self.packed_replay.sample(model.num_timesteps // model.n_envs)
+            self.packed_replay = PackedReplay(buffer)
+        return self.packed_replay.sample(batch_size, model.num_timesteps // model.n_envs)
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
