@@ -120,13 +120,14 @@ def draw_intervals(
     labels: Sequence[str],
     colors: Sequence[Any],
     intervals: Sequence[tuple[float, float, float]],
+    title: str,
     xlabel: str,
 ) -> None:
     """One row for each label: a point and its interval. :param intervals: point, low, high"""
     for row, (color, (point, low, high)) in enumerate(zip(colors, intervals, strict=True)):
         axes.plot([low, high], [row, row], color=color, lw=6, alpha=0.3, solid_capstyle="butt")
         axes.plot(point, row, "o", color=color)
-    style_axes(axes, "", xlabel, "")
+    style_axes(axes, title, xlabel, "")
     axes.set_yticks(range(len(labels)), labels)
     axes.set_ylim(len(labels) - 0.5, -0.5)
 

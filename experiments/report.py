@@ -147,19 +147,21 @@ class Report:
                 for tasks in scores.values()
             ]
             envs = _and(self.common_envs(labels))
+            steps = _steps([g for g in self.groups if g.label in labels and g.env_id in self.common_envs(labels)])
             table = pd.DataFrame(intervals, columns=["iqm", "low", "high"]).assign(algorithm=labels, tasks=envs)
             self.write_table("aggregate", table)
-            runs = ", ".join(f"{label} {sum(map(len, scores[label]))} runs" for label in labels)
+            runs = [f"{sum(map(len, scores[label]))} runs" for label in labels]
             section.pictures.append(
                 self.draw(
                     "aggregate",
                     f"Final returns over {envs}: interquartile mean of scores with 95 % stratified bootstrap interval. "
-                    f"0 and 1 are the lowest and highest single run on a task in this report. {runs}.",
+                    "0 and 1 are the lowest and highest single run on a task in this report.",
                     figures.draw_intervals,
-                    labels,
+                    [f"{label}\n{n}" for label, n in zip(labels, runs, strict=True)],
                     [self.colors[label] for label in labels],
                     intervals,
-                    "IQM of normalised scores",
+                    f"{envs}, {steps}",
+                    "IQM of normalised final returns",
                 )
             )
         return section
@@ -209,7 +211,7 @@ class Report:
                         figures.draw_sweep,
                         [value for value, _ in done],
                         [returns for _, returns in done],
-                        groups[0].env_id,
+                        f"{groups[0].env_id}, {_steps(groups)}",
                         "λ",
                         self.colors["TDC"],
                     )
@@ -285,7 +287,7 @@ class Report:
                         labels,
                         [self.colors[label] for label in labels],
                         [returns for _, returns in tested],
-                        env_id,
+                        f"{env_id}, {_steps(some)}",
                     )
                 )
         return section
