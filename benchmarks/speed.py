@@ -11,6 +11,7 @@ import importlib
 import json
 import os
 import platform
+import random
 import subprocess
 import sys
 import time
@@ -32,6 +33,7 @@ TARGETS = {
     ("SBX TD3", 2): 1.0,
     ("naive transcription", 2): 6.5,
 }
+WARM_UP = 5  # calls at the beginning of a turn that are not measured
 HUGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 OPTIONS = ("compile_loss", "bfloat16")
 
@@ -143,16 +145,38 @@ class Load:
         return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
 
-def time_calls(functions: dict[str, Callable[[], Any]], rounds: int, calls: dict[str, int]) -> dict[str, list[float]]:
-    """:return: milliseconds per call, (rounds,) for every function; one after the other in every round"""
+def time_calls(functions: dict[str, Callable[[int], Any]], rounds: int, calls: int) -> dict[str, list[float]]:
+    """
+    :param functions: by name; each takes how often it is to do what is measured
+    :return: milliseconds per call, (rounds,) for every function; in every round one after the other, in another order
+    """
     times: dict[str, list[float]] = {name: [] for name in functions}
+    shuffle = random.Random(0)
     for _ in range(rounds):
-        for name, function in functions.items():
+        for name in shuffle.sample(list(functions), len(functions)):
+            functions[name](WARM_UP)  # whoever ran before has left its data in the caches and its threads awake
             start = time.perf_counter()
-            for _ in range(calls[name]):
-                function()
-            times[name].append(1000 * (time.perf_counter() - start) / calls[name])
+            functions[name](calls)
+            times[name].append(1000 * (time.perf_counter() - start) / calls)
     return times
+
+
+def repeat(function: Callable[[], Any]) -> Callable[[int], None]:
+    """:return: what calls it a number of times"""
+
+    def run(n: int) -> None:
+        for _ in range(n):
+            function()
+
+    return run
+
+
+def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], None]]:
+    """:return: by name, for :func:`time_calls`: those of a model, and the matrix products of one"""
+    return {
+        "TDC": repeat(lambda: model.train(1, batch_size)),
+        "matrix products": repeat(matrix_products(model)),
+    }
 
 
 def measure_env(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
@@ -160,14 +184,13 @@ def measure_env(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
     models = make_models(env_id)
     for model in models.values():
         model.learn(340)
-    learn = {name: lambda model=model: model.learn(steps, reset_num_timesteps=False) for name, model in models.items()}
+    learn = {name: lambda n, model=model: model.learn(n, reset_num_timesteps=False) for name, model in models.items()}
     with Load() as load:
-        step_times = time_calls(learn, rounds, dict.fromkeys(learn, 1))
+        step_times = time_calls(learn, rounds, steps)
         tdc = models["TDC"]
-        gradient = {"TDC": lambda: tdc.train(1, 256), "matrix products": matrix_products(tdc)}
-        gradient_times = time_calls(gradient, 4 * rounds, dict.fromkeys(gradient, 20))
+        gradient_times = time_calls(gradient_steps(tdc, 256), 4 * rounds, 20)
     return {
-        "steps": {name: [t / steps for t in times] for name, times in step_times.items()},
+        "steps": step_times,
         "gradient": gradient_times,
         "errors": {option: gradient_error(tdc, models[f"TDC, {option}"]) for option in OPTIONS if env_id == ENVS[0]},
         "foreign_load": load.foreign,
@@ -205,11 +228,11 @@ def measure_scaling(rounds: int) -> dict[str, Any]:
             seed=0,
         ).learn(300)
         model.train(2, batch_size)
-        functions = {"TDC": lambda: model.train(1, batch_size), "matrix products": matrix_products(model)}
+        functions = gradient_steps(model, batch_size)
         start = time.perf_counter()
         model.train(2, batch_size)
         calls = max(2, min(20, int(0.2 / (time.perf_counter() - start))))
-        return time_calls(functions, rounds, dict.fromkeys(functions, calls))
+        return time_calls(functions, rounds, calls)
 
     with Load() as load:
         result: dict[str, Any] = {
