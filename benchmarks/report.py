@@ -61,11 +61,10 @@ def errors_of_options(results: dict[str, Any]) -> list[str]:
 
 def table_of_runs(together: list[dict[str, Any]]) -> list[str]:
     """Steps per second of all runs together, against runs and threads."""
-    lines = ["| runs at once | threads each | huge pages | steps/s of all together (each turn) |", "|---|---|---|---|"]
+    lines = ["| runs at once | threads each | steps/s of all together (each turn) |", "|---|---|---|"]
     for row in together:
         turns = ", ".join(f"{rate:.0f}" for rate in row["rates"])
-        pages = "yes" if row["huge_pages"] else ""
-        lines.append(f"| {row['runs']} | {row['threads']} | {pages} | **{np.median(row['rates']):.0f}** ({turns}) |")
+        lines.append(f"| {row['runs']} | {row['threads']} | **{np.median(row['rates']):.0f}** ({turns}) |")
     return lines
 
 
@@ -113,7 +112,7 @@ def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str,
     lines += [
         "## Runs at once",
         "",
-        "TDC on HalfCheetah-v4, on all cores. Huge pages: `GLIBC_TUNABLES=glibc.malloc.hugetlb=1`.",
+        "TDC on HalfCheetah-v4, on all cores.",
         "",
         *table_of_runs(results["together"]),
         "",

@@ -34,7 +34,6 @@ TARGETS = {
     ("naive transcription", 2): 6.5,
 }
 WARM_UP = 5  # calls at the beginning of a turn that are not measured
-HUGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 OPTIONS = ("compile_loss", "bfloat16")
 
 
@@ -253,10 +252,10 @@ def run_child(task: str, threads: int, arguments: argparse.Namespace) -> dict[st
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def run_together(runs: int, threads: int, huge_pages: bool, seconds: float) -> float:
+def run_together(runs: int, threads: int, seconds: float) -> float:
     """:return: environment steps per second of some runs of TDC at once, all together, on all cores"""
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
-    environment = {**os.environ, **dict.fromkeys(names, str(threads)), **(HUGE_PAGES if huge_pages else {})}
+    environment = {**os.environ, **dict.fromkeys(names, str(threads))}
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.speed", "--task", "rate", "--threads", str(threads)]
     children = [
         subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -287,16 +286,14 @@ def measure_rate() -> None:
 
 
 def measure_threads(rounds: int, seconds: float = 6.0) -> list[dict[str, Any]]:
-    """One run alone and as many as cores, with one thread each and with as many as cores; alone, on huge pages too."""
+    """One run alone and as many as cores, with one thread each and with as many as cores."""
     cores = os.cpu_count() or 1
-    settings = [(runs, threads, False) for runs in (1, cores) for threads in (1, cores)]
-    settings += [(1, threads, True) for threads in (1, cores)]
-    rates: dict[tuple[int, int, bool], list[float]] = {setting: [] for setting in settings}
+    settings = [(runs, threads) for runs in (1, cores) for threads in (1, cores)]
+    rates: dict[tuple[int, int], list[float]] = {setting: [] for setting in settings}
     for _ in range(rounds):
         for setting in settings:
             rates[setting].append(run_together(*setting, seconds))
-    names = ("runs", "threads", "huge_pages")
-    return [{**dict(zip(names, setting, strict=True)), "rates": rates[setting]} for setting in settings]
+    return [{"runs": runs, "threads": threads, "rates": rates[runs, threads]} for runs, threads in settings]
 
 
 def work(arguments: argparse.Namespace) -> None:
