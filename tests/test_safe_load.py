@@ -25,6 +25,7 @@ from stable_baselines3 import DDPG, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -249,6 +250,36 @@ def test_no_poisoned_field_runs(saved, tmp_path, marker, poison):
             assert message is not None, name
             assert name in message
         assert not marker.exists(), name
+
+
+class ByName:
+    """``getattr(owner, name)``, as Python 3.11.0 to 3.11.3 pickle ``TrainFrequencyUnit.STEP``."""
+
+    def __init__(self, owner, name):
+        self.owner, self.name = owner, name
+
+    def __reduce__(self):
+        return getattr, (self.owner, self.name)
+
+
+class Every:
+    """``TrainFreq(frequency, unit)``."""
+
+    def __init__(self, unit):
+        self.unit = unit
+
+    def __reduce__(self):
+        return TrainFreq, (3, self.unit)
+
+
+def test_units_as_all_versions_of_python_pickle_them(saved, tmp_path, marker):
+    for unit in (TrainFrequencyUnit.EPISODE, ByName(TrainFrequencyUnit, "EPISODE")):
+        path = with_fields(saved, tmp_path / "x.zip", train_freq=serialized(Every(unit)))
+        assert load_safely(path, device="cpu").train_freq == TrainFreq(3, TrainFrequencyUnit.EPISODE)
+    for owner, name in ((TrainFrequencyUnit, "mro"), (TrainFreq, "count"), (os, "system"), (Poison(), "x")):
+        path = with_fields(saved, tmp_path / "x.zip", train_freq=serialized(Every(ByName(owner, name))))
+        assert "train_freq" in refuse(path)
+        assert not marker.exists()
 
 
 def test_the_poison_is_one(saved, tmp_path, marker):

@@ -4,6 +4,7 @@ import math
 import re
 from collections import OrderedDict
 from collections.abc import Callable
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -208,6 +209,24 @@ def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
 
 
 _SB3 = "stable_baselines3.common"
+_ENUMS: dict[Name, type[Enum]] = {
+    Name(f"{_SB3}.type_aliases", "TrainFrequencyUnit"): TrainFrequencyUnit,
+    name_of(GoalSelectionStrategy): GoalSelectionStrategy,
+}
+
+
+def _enum_of_value(call: Call, make: Rebuild) -> Enum:
+    return _ENUMS[call.function](*_arguments(call, make, 1))
+
+
+def _enum_of_name(call: Call, make: Rebuild) -> Enum:
+    """``getattr(SomeEnum, "MEMBER")``, as the first versions of Python 3.11 pickle a member; of nothing but an enum."""
+    cls, member = call.args
+    if not (isinstance(cls, Name) and cls in _ENUMS and isinstance(member, str) and member in _ENUMS[cls].__members__):
+        raise UnsafeFileError(f"a call of {call.function} of something that is no known enum")
+    return _ENUMS[cls][member]
+
+
 CALLS: dict[Name, Callable[[Call, Rebuild], Any]] = {
     Name("collections", "OrderedDict"): _ordered_dict,
     Name("numpy", "dtype"): _dtype,
@@ -229,9 +248,7 @@ CALLS: dict[Name, Callable[[Call, Rebuild], Any]] = {
     Name(f"{_SB3}.utils", "FloatSchedule"): _float_schedule,
     Name("rl_zoo3.utils", "SimpleLinearSchedule"): _zoo_schedule,
     Name(f"{_SB3}.type_aliases", "TrainFreq"): _train_freq,
-    Name(f"{_SB3}.type_aliases", "TrainFrequencyUnit"): lambda call, make: TrainFrequencyUnit(
-        *_arguments(call, make, 1)
-    ),
-    name_of(GoalSelectionStrategy): lambda call, make: GoalSelectionStrategy(*_arguments(call, make, 1)),
+    **dict.fromkeys(_ENUMS, _enum_of_value),
+    Name("builtins", "getattr"): _enum_of_name,
     Name(f"{_SB3}.running_mean_std", "RunningMeanStd"): _running_mean_std,
 }
