@@ -146,18 +146,18 @@ class Report:
                 (float(statistics.interquartile_mean(*tasks)), *statistics.iqm_interval(tasks))
                 for tasks in scores.values()
             ]
-            envs = _and(self.common_envs(labels))
-            steps = _steps([g for g in self.groups if g.label in labels and g.env_id in self.common_envs(labels)])
+            env_ids = self.common_envs(labels)
+            envs = _and(env_ids)
+            steps = _steps([g for g in self.groups if g.label in labels and g.env_id in env_ids])
             table = pd.DataFrame(intervals, columns=["iqm", "low", "high"]).assign(algorithm=labels, tasks=envs)
             self.write_table("aggregate", table)
-            runs = [f"{sum(map(len, scores[label]))} runs" for label in labels]
             section.pictures.append(
                 self.draw(
                     "aggregate",
                     f"Final returns over {envs}: interquartile mean of scores with 95 % stratified bootstrap interval. "
                     "0 and 1 are the lowest and highest single run on a task in this report.",
                     figures.draw_intervals,
-                    [f"{label}\n{n}" for label, n in zip(labels, runs, strict=True)],
+                    [f"{label}\n{sum(map(len, scores[label]))} runs" for label in labels],
                     [self.colors[label] for label in labels],
                     intervals,
                     f"{envs}, {steps}",
