@@ -91,21 +91,20 @@ def matrix_products(model: Any) -> Callable[[], None]:
     import torch as th
 
     fused = model._fused_update
-    n_actions = fused.actions.shape[1]
-    slopes = th.randn_like(fused.critic.activations[-1]), th.randn_like(fused.value.activations[-1])
-    action_slope = th.randn(fused.batch_size, n_actions)
+    slopes = th.randn_like(fused.critic.outputs[-1]), th.randn_like(fused.value.outputs[-1])
+    action_slope = th.randn_like(fused.noise)
     calls = 0
 
     def forward(network: Any) -> None:
-        for i, layer in enumerate(network.layers):
-            layer.affine(layer.bias, network.activations[i], layer.weight, out=network.activations[i + 1])
+        for layer, inputs, output, _ in network.forward_steps:
+            layer.affine(layer.bias, inputs, layer.weight, out=output)
 
-    def backward(network: Any, slope: Any, gradients: Any) -> Any:
-        for i in reversed(range(len(network.layers))):
-            if gradients is not None:
-                network.layers[i].matmul(network.activations[i].mT, slope, out=gradients[i].weight)
-            if i > 0:
-                slope = network.layers[i].matmul(slope, network.layers[i].weight.mT, out=network.slopes[i - 1])
+    def backward(network: Any, slope: Any) -> Any:
+        for layer, gradient, _, transposed_inputs, slope_below in network.backward_steps:
+            if gradient is not None:
+                layer.matmul(transposed_inputs, slope, out=gradient.weight)
+            if slope_below is not None:
+                slope = layer.matmul(slope, layer.transposed, out=slope_below)
         return slope
 
     def run() -> None:
@@ -114,12 +113,12 @@ def matrix_products(model: Any) -> Callable[[], None]:
         forward(fused.target_head.network)
         forward(fused.critic_target)
         forward(fused.critic)
-        backward(fused.critic, slopes[0], fused.critic_gradient)
+        backward(fused.critic, slopes[0])
         if calls % model.policy_delay == 0:
             forward(fused.head.network)
             forward(fused.value)
-            backward(fused.value, slopes[1], None) @ fused.action_weight.mT
-            backward(fused.head.network, action_slope, fused.actor_gradient)
+            backward(fused.value, slopes[1]) @ fused.action_weight
+            backward(fused.head.network, action_slope)
 
     return run
 

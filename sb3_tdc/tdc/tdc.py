@@ -361,9 +361,8 @@ class TDC(OffPolicyAlgorithm):
         current_quantiles = self.critic(replay_data.observations, replay_data.actions)
 
         # Only the gradient of the loss (Eq. 8–10) is needed to learn
-        self.critic.optimizer.zero_grad()
-        current_quantiles.backward(quantile_huber_gradient(current_quantiles, target.quantiles, self.kappa))
-        self.critic.optimizer.step()
+        slope = quantile_huber_gradient(current_quantiles, target.quantiles, self.kappa)
+        self._minimize(current_quantiles, self.critic.optimizer, slope)
         if self.diagnoses_critics:
             self.diagnose_critics(current_quantiles.detach(), target)
 
@@ -401,13 +400,16 @@ class TDC(OffPolicyAlgorithm):
             self.diagnose(ent_coef_loss=ent_coef_loss.detach())
 
     @staticmethod
-    def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
-        optimizer.zero_grad()
-        # Gradients of these parameters alone: the critics stay as they are, and cost nothing
+    def _minimize(output: th.Tensor, optimizer: th.optim.Optimizer, slope: th.Tensor | None = None) -> None:
+        """One step down a loss: the output, or what has this slope at the output."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         learning = [parameter for parameter in parameters if parameter.requires_grad]
-        if learning:
-            loss.backward(inputs=learning)
+        # Gradients of these parameters alone: others stay as they are, and cost nothing
+        gradients = th.autograd.grad(output, learning, slope, allow_unused=True) if learning else ()
+        for parameter in parameters:
+            parameter.grad = None
+        for parameter, gradient in zip(learning, gradients, strict=True):
+            parameter.grad = gradient
         optimizer.step()
 
     @th.no_grad()

@@ -294,7 +294,8 @@ def test_rounded_products_learn_nearly_the_same(stochastic_actor):
         model.train(gradient_steps=2, batch_size=64)
         update = model._fused_update
         assert model.critic.layers[0].weight.dtype == th.float32
-        gradients.append((update.critic_gradient[1].weight.clone(), update.actor_gradient[1].weight.clone()))
+        adams = (update.critic_adam, update.actor_adam)
+        gradients.append([adam.views(adam.gradient)[2].clone() for adam in adams])  # the weights of the second layer
     for exact, rounded in zip(*gradients, strict=True):
         error = (rounded - exact).norm() / exact.norm()
         assert 1e-4 < error < 0.2
@@ -305,8 +306,8 @@ def test_rounded_products_learn_nearly_the_same(stochastic_actor):
 def test_compiled_gradient_of_the_loss(kappa):
     """Needs a C++ compiler."""
     current, target = th.randn(2, 50, 16), th.randn(50, 12)
-    plain, compiled = (QuantileHuberGradient(current, 12, compiled) for compiled in (False, True))
-    th.testing.assert_close(compiled(current, target, kappa), plain(current, target, kappa), rtol=1e-5, atol=1e-8)
+    plain, compiled = (QuantileHuberGradient(current, target, compiled) for compiled in (False, True))
+    th.testing.assert_close(compiled(kappa), plain(kappa), rtol=1e-5, atol=1e-8)
     model = make(fused_kwargs={"compile_loss": True}).learn(60)
     assert model._fused_update.loss_gradient.compiled is not None
 

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc.tdc.fused.replay import PackedReplay
@@ -34,6 +35,14 @@ def make_buffer(n_envs=1, **kwargs):
     return ReplayBuffer(10 * n_envs, space, env.action_space, "cpu", n_envs=n_envs, **kwargs)
 
 
+def draw(packed_replay, batch_size, steps):
+    """As SB3 would return it."""
+    rows = th.empty(batch_size, packed_replay.slots.shape[-1])
+    packed_replay.sample(rows, steps)
+    observations, actions, next_observations, rewards, dones, timeouts = rows.split([3, 2, 3, 1, 1, 1], dim=1)
+    return ReplayBufferSamples(observations, actions, next_observations, dones * (1 - timeouts), rewards)
+
+
 @pytest.mark.parametrize("mirrored", [False, True], ids=["in place", "copied, as to a device"])
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("kwargs", [{}, {"handle_timeout_termination": False}], ids=str)
@@ -51,7 +60,7 @@ def test_returns_what_the_buffer_returns(n_envs, mirrored, kwargs):
         np.random.seed(added)
         expected = plain.sample(20)
         np.random.seed(added)
-        samples = packed_replay.sample(20, steps)
+        samples = draw(packed_replay, 20, steps)
         for name, got, want in zip(expected._fields, samples, expected, strict=True):
             assert got is want is None or th.equal(got, want.float()), (added, name)
         np.random.seed(added)  # the buffer itself goes on working
@@ -66,7 +75,7 @@ def test_the_arrays_of_the_buffer_are_the_rows():
     packed_replay = PackedReplay(buffer)
     buffer.rewards[:] = 7
     buffer.dones[:], buffer.timeouts[:] = 1, 0
-    samples = packed_replay.sample(20, 5)
+    samples = draw(packed_replay, 20, 5)
     assert (samples.rewards == 7).all()
     assert (samples.dones == 1).all()
     copy = pickle.loads(pickle.dumps(buffer))

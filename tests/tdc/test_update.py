@@ -132,7 +132,9 @@ def test_updates_equal_algorithm_1(monkeypatch, stochastic, fused, n_critics, la
         noises.append(noise.double())
         return noise
 
-    monkeypatch.setattr(th.Tensor, "normal_", lambda tensor: tensor.copy_(draw(tensor.shape)))
+    monkeypatch.setattr(
+        th.Tensor, "normal_", lambda tensor, mean=0, std=1: tensor.copy_(mean + std * draw(tensor.shape))
+    )
     monkeypatch.setattr(th, "randn_like", lambda tensor: draw(tensor.shape))
     monkeypatch.setattr(
         th.distributions.Normal, "rsample", lambda self, shape=(): self.loc + self.scale * draw(self.loc.shape)

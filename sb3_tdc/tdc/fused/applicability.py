@@ -1,6 +1,5 @@
 """Where the fused update applies."""
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch as th
@@ -38,7 +37,7 @@ def obstacles(model: "TDC") -> list[str]:
     found += [f"{name} is overridden" for name in _METHODS if getattr(type(model), name) is not getattr(TDC, name)]
     networks = (policy, policy.actor, policy.actor_target, policy.critic, policy.critic_target)
     found += [f"{type(n).__qualname__} is a class of its own" for n in networks if type(n) not in _CLASSES]
-    if has_hooks(policy.modules()):
+    if any(hooks(policy)):
         found.append("a network has hooks")
     if not all(is_plain_adam(network.optimizer) for network in (policy.actor, policy.critic)):
         kind = f"{policy.optimizer_class.__name__} with {policy.optimizer_kwargs}"
@@ -60,9 +59,13 @@ def is_plain_adam(optimizer: Any) -> bool:
     return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or isinstance(group["lr"], th.Tensor))
 
 
-def has_hooks(modules: Iterable[nn.Module]) -> bool:
-    """:return: whether a module wants to be told of passes"""
-    return any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules)
+def hooks(network: nn.Module) -> list[dict[int, Any]]:
+    """:return: where modules keep who wants to be told of their passes"""
+    return [
+        kept
+        for m in network.modules()
+        for kept in (m._forward_hooks, m._forward_pre_hooks, m._backward_hooks, m._backward_pre_hooks)
+    ]
 
 
 def check_options(fused_kwargs: dict[str, Any]) -> None:

@@ -5,6 +5,7 @@ Shapes: C critics, B transitions, A action.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
@@ -25,6 +26,7 @@ class Layer:
 
     def __init__(self, weight: th.Tensor, bias: th.Tensor, bfloat16: bool = False):
         self.weight, self.bias, self.bfloat16 = weight, bias, bfloat16
+        self.transposed = weight.mT
         self.affine: Any = th.baddbmm if weight.ndim == 3 else th.addmm
         self.matmul: Any = th.bmm if weight.ndim == 3 else th.mm
         if bfloat16:
@@ -63,6 +65,7 @@ class Mlp:
 
     :param layers: of the network
     :param inputs: (B, in), filled before each pass
+    :param gradients: where a backward pass writes those of the parameters; None to go without
     :param activate_output: whether there is a ReLU behind the last layer too
     :param outputs: buffers for the outputs of the layers
     :param slopes: buffers for the slopes there; those of passes that are over by then keep the cache small
@@ -72,91 +75,126 @@ class Mlp:
         self,
         layers: list[Layer],
         inputs: th.Tensor,
+        gradients: Sequence[Layer | None] | None = None,
         activate_output: bool = False,
         outputs: list[th.Tensor] | None = None,
         slopes: list[th.Tensor] | None = None,
     ):
-        self.layers, self.activate_output = layers, activate_output
         stacked = layers[0].weight.shape[:-2]
         if outputs is None:
             outputs = [inputs.new_empty(*stacked, len(inputs), layer.bias.shape[-1]) for layer in layers]
-        self.activations = [inputs.expand(*stacked, -1, -1), *outputs]
+        self.layers, self.outputs = layers, outputs
         self.slopes = [th.empty_like(output) for output in outputs] if slopes is None else slopes
+        # Both passes with all their tensors, so that none is looked up or viewed again
+        all_inputs = [inputs.expand(*stacked, -1, -1), *outputs[:-1]]
+        activated = [True] * (len(layers) - 1) + [activate_output]
+        self.forward_steps = list(zip(layers, all_inputs, outputs, activated, strict=True))
+        slopes_below = [None, *self.slopes[: len(layers) - 1]]
+        transposed = [layer_inputs.mT for layer_inputs in all_inputs]
+        steps = zip(layers, gradients or [None] * len(layers), all_inputs, transposed, slopes_below, strict=True)
+        self.backward_steps = list(steps)[::-1]
 
     def forward(self) -> th.Tensor:
         """:return: (B, out) or (C, B, out), overwritten by the next pass"""
-        last = len(self.layers) - 1
-        for i, layer in enumerate(self.layers):
-            output = layer.affine(layer.bias, self.activations[i], layer.weight, out=self.activations[i + 1])
-            if i < last or self.activate_output:
+        for layer, inputs, output, activated in self.forward_steps:
+            layer.affine(layer.bias, inputs, layer.weight, out=output)
+            if activated:
                 output.relu_()
         return output
 
-    def backward(self, slope: th.Tensor, gradients: list[Layer] | None) -> th.Tensor:
+    def backward(self, slope: th.Tensor) -> th.Tensor:
         """
         :param slope: of the loss at the output of the last layer (before a ReLU); the buffers of the last pass count
-        :param gradients: where to write those of the parameters; None to go without
         :return: the slope at the output of the first layer, before its ReLU
         """
-        for i in reversed(range(len(self.layers))):
-            if gradients is not None:
-                gradient = gradients[i]
-                gradient.matmul(self.activations[i].mT, slope, out=gradient.weight)
+        for layer, gradient, inputs, transposed_inputs, slope_below in self.backward_steps:
+            if gradient is not None:
+                gradient.matmul(transposed_inputs, slope, out=gradient.weight)
                 th.sum(slope, dim=-2, keepdim=True, out=gradient.bias)
-            if i > 0:
-                slope = self.layers[i].matmul(slope, self.layers[i].weight.mT, out=self.slopes[i - 1])
-                relu_backward(slope, self.activations[i])
+            if slope_below is not None:
+                layer.matmul(slope, layer.transposed, out=slope_below)
+                slope = relu_backward(slope_below, inputs, out=slope_below)
         return slope
 
 
-def relu_backward(slope: th.Tensor, activation: th.Tensor) -> th.Tensor:
-    """In place: no slope where the activation is 0."""
-    return th.ops.aten.threshold_backward.grad_input(slope, activation, 0, grad_input=slope)
+_threshold_backward = th.ops.aten.threshold_backward.grad_input
+_tanh_backward = th.ops.aten.tanh_backward.grad_input
+
+
+def relu_backward(slope: th.Tensor, activation: th.Tensor, out: th.Tensor) -> th.Tensor:
+    """:return: the slope where the activation is not 0, in ``out``"""
+    return _threshold_backward(slope, activation, 0, grad_input=out)
 
 
 class DeterministicHead:
-    """TD3's actor: a = tanh(f(s)) (Eq. 20)."""
+    """
+    TD3's actor: a = tanh(f(s)) (Eq. 20).
 
-    def __init__(self, layers: list[Layer], observations: th.Tensor):
-        self.network = Mlp(layers, observations)
+    :param layers: of the network
+    :param observations: (B, D), filled before each pass
+    :param actions: (B, A), where the mean actions are written
+    :param gradients: see :class:`Mlp`
+    """
+
+    def __init__(
+        self,
+        layers: list[Layer],
+        observations: th.Tensor,
+        actions: th.Tensor,
+        gradients: Sequence[Layer | None] | None = None,
+    ):
+        self.network, self.actions = Mlp(layers, observations, gradients), actions
 
     def act(self) -> th.Tensor:
-        """:return: (B, A), the mean action; overwritten by the next pass"""
-        self.actions = self.network.forward().tanh_()
-        return self.actions
+        """:return: ``actions``"""
+        return self.actions.copy_(self.network.forward().tanh_())
 
-    def backward(self, action_slope: th.Tensor, gradients: list[Layer]) -> None:
+    def backward(self, action_slope: th.Tensor) -> None:
         """:param action_slope: (B, A), of the loss at the actions; overwritten"""
-        slope = th.ops.aten.tanh_backward.grad_input(action_slope, self.actions, grad_input=action_slope)
-        self.network.backward(slope, gradients)
+        self.network.backward(_tanh_backward(action_slope, self.network.outputs[-1], grad_input=action_slope))
 
 
 class TanhGaussianHead:
-    """SAC's actor: a = tanh(u), u = m(s) + σ(s)·ε (Eq. 21)."""
+    """
+    SAC's actor: a = tanh(u), u = m(s) + σ(s)·ε (Eq. 21).
 
-    def __init__(self, layers: list[Layer], observations: th.Tensor):
+    :param layers: of the network; the last two are m and log σ
+    :param observations: (B, D), filled before each pass
+    :param actions: (B, A), where the samples are written
+    :param gradients: see :class:`Mlp`
+    """
+
+    def __init__(
+        self,
+        layers: list[Layer],
+        observations: th.Tensor,
+        actions: th.Tensor,
+        gradients: Sequence[Layer | None] | None = None,
+    ):
         *hidden, self.mean_layer, self.log_std_layer = layers
-        self.network = Mlp(hidden, observations, activate_output=True)
-        shape = (len(observations), self.mean_layer.bias.shape[-1])
-        self.noise, self.mean, self.raw_log_std = (observations.new_empty(shape) for _ in range(3))
+        *hidden_gradients, self.mean_gradient, self.log_std_gradient = gradients or [None] * len(layers)
+        self.network = Mlp(hidden, observations, hidden_gradients, activate_output=True)
+        self.actions = actions
+        self.hidden = self.network.outputs[-1]
+        self.transposed_hidden = self.hidden.mT
+        self.noise, self.sample, self.raw_log_std = (th.empty_like(actions) for _ in range(3))
 
-    def sample(self) -> th.Tensor:
-        """:return: (B, A), a sample of the policy"""
-        self.hidden = self.network.forward()
-        th.addmm(self.mean_layer.bias, self.hidden, self.mean_layer.weight, out=self.mean)
+    def act(self) -> th.Tensor:
+        """:return: ``actions``, a sample of the policy"""
+        self.network.forward()
+        th.addmm(self.mean_layer.bias, self.hidden, self.mean_layer.weight, out=self.sample)
         th.addmm(self.log_std_layer.bias, self.hidden, self.log_std_layer.weight, out=self.raw_log_std)
         self.log_std = self.raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
         self.spread = self.log_std.exp().mul_(self.noise.normal_())
-        self.actions = (self.mean + self.spread).tanh_()
-        return self.actions
+        return self.actions.copy_(self.sample.add_(self.spread).tanh_())
 
     def log_prob(self) -> th.Tensor:
         """:return: (B,), log density of the last sample"""
-        self.squash = 1 - self.actions.square()
+        self.squash = 1 - self.sample.square()
         log_density = self.noise.square().mul_(-0.5).sub_(self.log_std).sub_(_LOG_SQRT_2_PI)
         return log_density.sub_((self.squash + _TANH_EPSILON).log_()).sum(dim=1)
 
-    def backward(self, action_slope: th.Tensor, ent_coef: th.Tensor, gradients: list[Layer]) -> None:
+    def backward(self, action_slope: th.Tensor, ent_coef: th.Tensor) -> None:
         """
         The slope of mean(α·log π) is added here. log π = −½ε² − log σ − log(1 − a² + e) + const, at fixed ε, so that
         ∂log π/∂u = 2a(1 − a²)/(1 − a² + e), ∂u/∂m = 1, ∂u/∂log σ = σε, and log σ itself counts −1.
@@ -164,20 +202,20 @@ class TanhGaussianHead:
         :param action_slope: (B, A), of the loss without the entropy, at the actions
         :param ent_coef: (1,), α
         """
-        coefficient = ent_coef / len(self.actions)
-        ratio = (2 * coefficient) * self.actions / (self.squash + _TANH_EPSILON)
+        coefficient = ent_coef / len(self.sample)
+        ratio = (2 * coefficient) * self.sample / (self.squash + _TANH_EPSILON)
         mean_slope = (action_slope + ratio).mul_(self.squash)
         log_std_slope = (mean_slope * self.spread).sub_(coefficient)
         log_std_slope.mul_((self.raw_log_std >= LOG_STD_MIN) & (self.raw_log_std <= LOG_STD_MAX))
-        *hidden, mean_gradient, log_std_gradient = gradients
         hidden_slope = None
         for slope, layer, gradient in (
-            (mean_slope, self.mean_layer, mean_gradient),
-            (log_std_slope, self.log_std_layer, log_std_gradient),
+            (mean_slope, self.mean_layer, self.mean_gradient),
+            (log_std_slope, self.log_std_layer, self.log_std_gradient),
         ):
-            th.mm(self.hidden.mT, slope, out=gradient.weight)
+            assert gradient is not None
+            th.mm(self.transposed_hidden, slope, out=gradient.weight)
             th.sum(slope, dim=0, keepdim=True, out=gradient.bias)
-            part = th.mm(slope, layer.weight.mT)
+            part = th.mm(slope, layer.transposed)
             hidden_slope = part if hidden_slope is None else hidden_slope.add_(part)
         assert hidden_slope is not None
-        self.network.backward(relu_backward(hidden_slope, self.hidden), hidden)
+        self.network.backward(relu_backward(hidden_slope, self.hidden, out=hidden_slope))

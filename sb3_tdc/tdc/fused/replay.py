@@ -3,9 +3,14 @@
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 _ARRAYS = ("observations", "actions", "next_observations", "rewards", "dones", "timeouts")
+_METHODS = {"sample", "_get_samples"}  # what is not done here if somebody has put another in the place of SB3's
+
+
+def row_widths(obs_dim: int, action_dim: int) -> list[int]:
+    """:return: how many columns of a row belong to s, a, s', r, d, t"""
+    return [obs_dim, action_dim, obs_dim, 1, 1, 1]
 
 
 class PackedReplay:
@@ -22,13 +27,12 @@ class PackedReplay:
 
     def __init__(self, buffer: ReplayBuffer):
         self.buffer = buffer
-        obs_dim, action_dim = buffer.observations.shape[-1], buffer.action_dim
-        self.widths = [obs_dim, action_dim, obs_dim, 1, 1, 1]
-        self.slots = np.zeros((buffer.buffer_size, buffer.n_envs, sum(self.widths)), dtype=np.float32)
-        columns = np.split(self.slots, np.cumsum(self.widths)[:-1], axis=-1)
+        widths = row_widths(buffer.observations.shape[-1], buffer.action_dim)
+        self.slots = np.zeros((buffer.buffer_size, buffer.n_envs, sum(widths)), dtype=np.float32)
+        columns = np.split(self.slots, np.cumsum(widths)[:-1], axis=-1)
         for name, part in zip(_ARRAYS, columns, strict=True):
             self._move(name, part)
-        self.host_rows = th.from_numpy(self.slots.reshape(-1, sum(self.widths)))
+        self.host_rows = th.from_numpy(self.slots.reshape(-1, sum(widths)))
         self.rows = self.host_rows.to(buffer.device)
         self.pos = 0
         self.steps: int | None = None  # when the rows were copied last
@@ -46,32 +50,35 @@ class PackedReplay:
         """:return: whether ``sample`` of this buffer is SB3's plain one, of flat observations of real numbers"""
         return (
             type(buffer) is ReplayBuffer
-            and not {"sample", "_get_samples"} & vars(buffer).keys()
+            and not _METHODS & vars(buffer).keys()
             and not buffer.optimize_memory_usage
             and buffer.observations.ndim == 3
             and buffer.observations.dtype.kind == buffer.actions.dtype.kind == "f"
         )
 
     def holds(self, buffer: ReplayBuffer) -> bool:
-        """:return: whether this is the buffer, and its arrays are still parts of the rows"""
-        return self.buffer is buffer and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)
+        """:return: whether this is the buffer, SB3 still samples it, and its arrays are still parts of the rows"""
+        attributes, slots = vars(buffer), self.slots
+        return (
+            self.buffer is buffer
+            and all(attributes[name].base is slots for name in _ARRAYS)
+            and not _METHODS & attributes.keys()
+        )
 
-    def sample(self, batch_size: int, steps: int) -> ReplayBufferSamples:
+    def sample(self, out: th.Tensor, steps: int) -> None:
         """
-        :param batch_size: B
+        Draw the minibatch that ``buffer.sample`` would, from the same random numbers.
+
+        :param out: (B, width of the rows), where it is written
         :param steps: count of steps of the environments, one for all of them
-        :return: what ``buffer.sample`` would, from the same random numbers
         """
         buffer = self.buffer
         if self.rows is not self.host_rows:
             self._copy_new_rows(steps)
-        slots = np.random.randint(0, buffer.size(), size=batch_size)
-        envs = np.random.randint(0, high=buffer.n_envs, size=(batch_size,))
-        indices = th.from_numpy(slots * buffer.n_envs + envs).to(self.rows.device, non_blocking=True)
-        batch = self.rows.index_select(0, indices)
-        observations, actions, next_observations, rewards, dones, timeouts = batch.split(self.widths, dim=1)
-        terminated = dones.addcmul_(dones, timeouts, value=-1)
-        return ReplayBufferSamples(observations, actions, next_observations, terminated, rewards)
+        indices = np.random.randint(0, buffer.size(), size=len(out))
+        if buffer.n_envs > 1:  # of one, SB3 draws nothing
+            indices = indices * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=(len(out),))
+        th.index_select(self.rows, 0, th.from_numpy(indices).to(self.rows.device, non_blocking=True), out=out)
 
     def _copy_new_rows(self, steps: int) -> None:
         """To the device."""

@@ -8,12 +8,14 @@ import torch as th
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_tdc.tdc.fused.applicability import has_hooks, is_plain_adam
+from sb3_tdc.tdc.fused.applicability import hooks
 from sb3_tdc.tdc.fused.flat_adam import FlatAdam
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
 from sb3_tdc.tdc.fused.networks import DeterministicHead, Layer, Mlp, TanhGaussianHead, make_layers, relu_backward
-from sb3_tdc.tdc.fused.replay import PackedReplay
-from sb3_tdc.tdc.quantiles import QuantileHuberGradient, Target, lcb_target
+from sb3_tdc.tdc.fused.replay import PackedReplay, row_widths
+from sb3_tdc.tdc.fused.scalar import Scalar
+from sb3_tdc.tdc.fused.target import LcbTarget
+from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 
 if TYPE_CHECKING:
     from sb3_tdc.tdc.tdc import TDC
@@ -36,45 +38,58 @@ class FusedUpdate:
 
     def __init__(self, model: "TDC", batch_size: int, packed_replay: PackedReplay | None = None):
         self.model, self.batch_size = model, batch_size
-        self.modules = list(model.policy.modules())
+        self.hooks = hooks(model.policy)
         self.critic_adam = FlatAdam(model.critic, model.critic_target)
         self.actor_adam = FlatAdam(model.actor, model.actor_target)
         self.constants = self._read_constants()
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
         self.packed_replay = packed_replay
-        obs_dim = model.policy.actor.features_dim
-        action_dim = get_action_dim(model.critic.action_space)
+        self._make_buffers(model.policy.actor.features_dim, get_action_dim(model.critic.action_space))
+        self._make_critics()
+        self._make_actors()
 
+    def _make_buffers(self, obs_dim: int, action_dim: int) -> None:
         def empty(*shape: int) -> th.Tensor:
-            return th.empty(shape, device=model.device)
+            return th.empty(shape, device=self.model.device)
 
+        batch_size = self.batch_size
+        widths = row_widths(obs_dim, action_dim)
+        self.rows = empty(batch_size, sum(widths))  # as a PackedReplay holds them
+        observations, actions, self.drawn_next_observations, rewards, dones, self.timeouts = self.rows.split(widths, 1)
         # [s | a] and [s' | ã]; the actor reads from the first columns, its actions go to the last
-        inputs, next_inputs = (empty(batch_size, obs_dim + action_dim) for _ in range(2))
-        self.observations, self.actions = inputs[:, :obs_dim], inputs[:, obs_dim:]
-        self.next_observations, self.next_actions = next_inputs[:, :obs_dim], next_inputs[:, obs_dim:]
-        self.rewards, self.dones, self.discounts = (empty(batch_size, 1) for _ in range(3))
+        self.inputs, self.next_inputs = self.rows[:, : obs_dim + action_dim], empty(batch_size, obs_dim + action_dim)
+        next_observations, self.next_actions = self.next_inputs.split([obs_dim, action_dim], 1)
+        self.minibatch = ReplayBufferSamples(observations, actions, next_observations, dones, rewards)
         self.noise = empty(batch_size, action_dim)
-        self.lam, self.ent_coef = empty(), empty(1)
+        self.discounts, self.lam = Scalar(empty(batch_size, 1)), Scalar(empty())
+        self.ent_coef = empty(1)
 
-        online, target, self.critic_gradient = self._networks(self.critic_adam)
-        self.critic_target = Mlp(target, next_inputs)
-        self.critic = Mlp(online, inputs, slopes=self.critic_target.activations[1:])
+    def _make_critics(self) -> None:
+        model, batch = self.model, self.minibatch
+        online, target, gradient = self._networks(self.critic_adam)
+        self.critic_target = Mlp(target, self.next_inputs)
+        self.target = LcbTarget(
+            self.critic_target.outputs[-1], batch.rewards, batch.dones, self.discounts.tensor, self.lam.tensor
+        )
+        self.critic = Mlp(online, self.inputs, gradient, slopes=self.critic_target.outputs)
         compiled = model.fused_kwargs.get("compile_loss", False)
-        self.loss_gradient = QuantileHuberGradient(self.critic.activations[-1], model.critic.n_quantiles, compiled)
+        self.loss_gradient = QuantileHuberGradient(self.critic.outputs[-1], self.target.quantiles, compiled)
 
         # Q₁: the hidden layers of the first critic, then the mean of its quantiles folded into the last layer
         *hidden, self.quantile_layer = (layer.first() for layer in online)
         outputs, slopes = (
-            [buffer[0] for buffer in buffers[: len(hidden)]]
-            for buffers in (self.critic.activations[1:], self.critic.slopes)
+            [buffer[0] for buffer in buffers[: len(hidden)]] for buffers in (self.critic.outputs, self.critic.slopes)
         )
-        self.value = Mlp(hidden, inputs, activate_output=True, outputs=outputs, slopes=slopes)
-        self.action_weight = online[0].weight[0, obs_dim:]  # (A, out)
+        self.value = Mlp(hidden, self.inputs, activate_output=True, outputs=outputs, slopes=slopes)
+        self.action_weight = online[0].weight[0, batch.observations.shape[1] :].mT  # (out, A)
 
-        online, target, self.actor_gradient = self._networks(self.actor_adam, n_outputs=1 + model.stochastic_actor)
+    def _make_actors(self) -> None:
+        model, batch = self.model, self.minibatch
+        online, target, gradient = self._networks(self.actor_adam, n_outputs=1 + model.stochastic_actor)
         self.mean_layers = online[:-1] if model.stochastic_actor else online
-        make_head = TanhGaussianHead if model.stochastic_actor else DeterministicHead
-        self.head, self.target_head = make_head(online, self.observations), make_head(target, self.next_observations)
+        make_head: Any = TanhGaussianHead if model.stochastic_actor else DeterministicHead
+        self.head = make_head(online, batch.observations, batch.actions, gradient)
+        self.target_head = make_head(target, batch.next_observations, self.next_actions)
 
     def _networks(self, adam: FlatAdam, n_outputs: int = 1) -> list[list[Layer]]:
         """Online, target, gradient."""
@@ -93,23 +108,35 @@ class FusedUpdate:
 
     def fits(self, batch_size: int) -> bool:
         """:return: whether the buffers are of this size, and all that :func:`obstacles` looks at is as it was"""
-        adams = (self.critic_adam, self.actor_adam)
         return (
             batch_size == self.batch_size
-            and all(is_plain_adam(adam.optimizer) and adam.owns_parameters() for adam in adams)
+            and self.critic_adam.owns_parameters()
+            and self.actor_adam.owns_parameters()
             and self.constants == self._read_constants()
-            and not has_hooks(self.modules)
+            and not any(self.hooks)
         )
 
     def sample(self, batch_size: int) -> ReplayBufferSamples:
-        """:return: a minibatch of the model's replay buffer"""
-        model = self.model
-        buffer, normalization = model.replay_buffer, model._vec_normalize_env
-        if normalization is not None or not PackedReplay.applies(buffer):
-            return buffer.sample(batch_size, env=normalization)
+        """:return: a minibatch of the model's replay buffer; of a packed one, overwritten by the next"""
+        model, packed = self.model, self._find_packed_replay()
+        if packed is None:
+            return model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
+        packed.sample(self.rows, model.num_timesteps // model.n_envs)
+        batch = self.minibatch
+        batch.next_observations.copy_(self.drawn_next_observations)
+        batch.dones.addcmul_(batch.dones, self.timeouts, value=-1)  # terminated
+        return batch
+
+    def _find_packed_replay(self) -> PackedReplay | None:
+        """The model's replay buffer as rows, where that is possible."""
+        buffer = self.model.replay_buffer
+        if self.model._vec_normalize_env is not None:
+            return None
         if self.packed_replay is None or not self.packed_replay.holds(buffer):
+            if not PackedReplay.applies(buffer):
+                return None
             self.packed_replay = PackedReplay(buffer)
-        return self.packed_replay.sample(batch_size, model.num_timesteps // model.n_envs)
+        return self.packed_replay
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
@@ -124,42 +151,34 @@ class FusedUpdate:
 
     def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
         """``TDC.update_critics``"""
-        model = self.model
-        self.lam.fill_(lam)
+        model, discounts = self.model, replay_data.discounts
+        self.lam.set(lam)
         self.critic_adam.read_learning_rate()
-        self.observations.copy_(replay_data.observations)
-        self.actions.copy_(replay_data.actions)
-        self.next_observations.copy_(replay_data.next_observations)
-        self.rewards.copy_(replay_data.rewards)
-        self.dones.copy_(replay_data.dones)
-        if replay_data.discounts is None:
-            self.discounts.fill_(model.gamma)
+        if replay_data is not self.minibatch:
+            for mine, other in zip(self.minibatch[:5], replay_data[:5], strict=True):
+                mine.copy_(other)
+        if discounts is None:
+            self.discounts.set(model.gamma)
         else:
-            self.discounts.copy_(replay_data.discounts)
-        current, target = self.run(self._update_critics)
+            self.discounts.copy_(discounts)
+        self.run(self._update_critics)
         if model.diagnoses_critics:
-            model.diagnose_critics(current.transpose(0, 1), target)
+            model.diagnose_critics(self.critic.outputs[-1].transpose(0, 1), self.target.details())
 
-    def _update_critics(self) -> tuple[th.Tensor, Target]:
+    def _update_critics(self) -> None:
         self._set_target_actions()
-        quantiles = self.critic_target.forward()  # Eq. 3, (C, B, N)
-        target = lcb_target(  # Eq. 4–7
-            quantiles.transpose(0, 1), self.rewards, self.dones, self.discounts, self.lam
-        )
-        current = self.critic.forward()
-        slope = self.loss_gradient(current, target.quantiles, self.model.kappa)  # Eq. 8–10
-        self.critic.backward(slope, self.critic_gradient)
+        self.critic_target.forward()  # Eq. 3
+        self.target.compute()  # Eq. 4–7
+        self.critic.forward()
+        self.critic.backward(self.loss_gradient(self.model.kappa))  # Eq. 8–10
         self.critic_adam.step()
-        return current, target
 
     def _set_target_actions(self) -> None:
-        if isinstance(self.target_head, TanhGaussianHead):
-            self.next_actions.copy_(self.target_head.sample())  # Eq. 2
-            return
-        model = self.model
-        noise = self.noise.normal_().mul_(model.target_policy_noise)
-        noise.clamp_(-model.target_noise_clip, model.target_noise_clip)
-        th.clamp(noise.add_(self.target_head.act()), -1, 1, out=self.next_actions)  # Eq. 1
+        actions, model = self.target_head.act(), self.model  # Eq. 2
+        if not model.stochastic_actor:
+            noise = self.noise.normal_(0, model.target_policy_noise)
+            noise.clamp_(-model.target_noise_clip, model.target_noise_clip)
+            actions.add_(noise).clamp_(-1, 1)  # Eq. 1
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
         """``TDC.update_actor``, on the observations of the critics' update"""
@@ -174,21 +193,17 @@ class FusedUpdate:
         model.update_temperature(log_prob, ent_coef, actor_loss.clone())
 
     def _update_deterministic_actor(self) -> th.Tensor:
-        head = self.head
-        assert isinstance(head, DeterministicHead)
-        self.actions.copy_(head.act())
+        self.head.act()
         values, slope = self._value_and_slope()
-        head.backward(slope, self.actor_gradient)
+        self.head.backward(slope)
         self.actor_adam.step()
         return -values.mean()  # Eq. 12
 
     def _update_stochastic_actor(self) -> tuple[th.Tensor, th.Tensor]:
-        head = self.head
-        assert isinstance(head, TanhGaussianHead)
-        self.actions.copy_(head.sample())
-        log_prob = head.log_prob()
+        self.head.act()
+        log_prob = self.head.log_prob()
         values, slope = self._value_and_slope()
-        head.backward(slope, self.ent_coef, self.actor_gradient)
+        self.head.backward(slope, self.ent_coef)
         self.actor_adam.step()
         return (self.ent_coef * log_prob - values).mean(), log_prob  # Eq. 13
 
@@ -196,9 +211,8 @@ class FusedUpdate:
         """Q₁ (Eq. 11) of the actions in the inputs, (B,), and the slope of −mean Q₁ at these actions, (B, A)."""
         hidden = self.value.forward()
         weight, bias = self.quantile_layer.weight.mean(dim=1), self.quantile_layer.bias.mean()
-        slope = (weight / -self.batch_size).expand_as(hidden).clone()
-        slope = self.value.backward(relu_backward(slope, hidden), gradients=None)
-        return hidden @ weight + bias, slope @ self.action_weight.mT
+        slope = relu_backward((weight / -self.batch_size).expand_as(hidden), hidden, out=self.value.slopes[-1])
+        return hidden @ weight + bias, self.value.backward(slope) @ self.action_weight
 
     def update_targets(self) -> None:
         """``TDC.update_targets``"""
