@@ -83,6 +83,20 @@ def test_both_agree_while_learning(stochastic_actor, kwargs):
     assert_close(states(readable), states(fused), rtol=1e-2, atol=1e-3)
 
 
+def test_both_agree_where_batches_have_discounts_of_their_own():
+    """As those of n-step returns have; and where the next batch has none again."""
+    rng = np.random.default_rng(1)
+    batches = list(random_batches(60))
+    for batch in batches[::3]:
+        batch.append(th.tensor(rng.random((BATCH, 1)), dtype=th.float32))
+    models = [make_model(fused=fused) for fused in (False, True)]
+    for model in models:
+        model.replay_buffer = BatchQueue(batches)
+        th.manual_seed(1)
+        model.train(gradient_steps=60, batch_size=BATCH)
+    assert_close(*map(states, models), rtol=1e-3, atol=2e-5)
+
+
 @HEADS
 def test_switching_in_mid_run(stochastic_actor):
     """Fused, readable, fused again: the state of the optimizers goes along."""

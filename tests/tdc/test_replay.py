@@ -127,6 +127,10 @@ def test_where_it_applies():
     own = make()
     own.replay_buffer.sample = own.replay_buffer.sample
     assert not PackedReplay.applies(own.replay_buffer)
+    packed = make(fused=True).learn(60)
+    replay = packed._fused_update.packed_replay
+    packed.replay_buffer.sample = packed.replay_buffer.sample  # whatever a user puts there
+    assert not replay.holds(packed.replay_buffer)
     integers = gym.spaces.Box(0, 255, (3,), np.int64)  # float32 cannot hold them all
     assert not PackedReplay.applies(ReplayBuffer(10, integers, TwoActions().action_space, "cpu"))
     normalized = make(VecNormalize(make_vec_env("Pendulum-v1")), fused=True).learn(60)
