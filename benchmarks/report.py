@@ -93,15 +93,16 @@ def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str,
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "speed.json").write_text(json.dumps(results))
     draw_scaling(results["scaling"], folder / "scaling.png")
+    arguments = f"--rounds {results['rounds']} --seconds {results['seconds']}"
     lines = [
         "# Speed",
         "",
-        f"Made by `python -m benchmarks.speed --rounds {results['rounds']} --steps {results['steps']}`; do not edit.",
+        f"Made by `python -m benchmarks.speed {arguments}`; do not edit.",
         "",
         f"{results['hardware']}. Whole environment steps (simulator, replay, one gradient step of batch 256, 256-256"
         " networks, float32), one gradient step a step. A ratio is the peer's time over TDC's (64 quantiles, fused"
         f" update, deterministic head), where no other is named; median (quartiles) of"
-        f" {results['rounds']} turns of {results['steps']} steps, taken in turn in one process, in another order each"
+        f" {results['rounds']} turns of {results['seconds']} s, taken in turn in one process, in another order each"
         " time, a few steps after each change. *2t*, *1t*: on two"
         " threads, on one thread of one core. *asked*: the aim set"
         " beforehand, for HalfCheetah-v4.",

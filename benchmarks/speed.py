@@ -1,7 +1,7 @@
 """
 ``python -m benchmarks.speed``: whole environment steps of TDC and its peers, side by side.
 
-Every row is a ratio of times measured in one process, in turn, a few dozen steps each: the machine may drift, the
+Every row is a ratio of times measured in one process, in turn, half a second each: the machine may drift, the
 ratio does not follow. Peers: ``pip install "sb3-tdc[bench]"``; one that is missing is left out, and said so.
 """
 
@@ -143,19 +143,25 @@ class Load:
         return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
 
-def time_calls(functions: dict[str, Callable[[int], Any]], rounds: int, calls: int) -> dict[str, list[float]]:
+def time_calls(functions: dict[str, Callable[[int], Any]], rounds: int, seconds: float) -> dict[str, list[float]]:
     """
     :param functions: by name; each takes how often it is to do what is measured
+    :param seconds: a turn, about
     :return: milliseconds per call, (rounds,) for every function; in every round one after the other, in another order
     """
     times: dict[str, list[float]] = {name: [] for name in functions}
     shuffle = random.Random(0)
+
+    def time_call(function: Callable[[int], Any], calls: int) -> float:
+        start = time.perf_counter()
+        function(calls)
+        return (time.perf_counter() - start) / calls
+
     for _ in range(rounds):
         for name in shuffle.sample(list(functions), len(functions)):
-            functions[name](WARM_UP)  # whoever ran before has left its data in the caches and its threads awake
-            start = time.perf_counter()
-            functions[name](calls)
-            times[name].append(1000 * (time.perf_counter() - start) / calls)
+            # Whoever ran before has left its data in the caches and its threads awake: the first calls are not counted
+            estimate = time_call(functions[name], WARM_UP)
+            times[name].append(1000 * time_call(functions[name], max(WARM_UP, round(seconds / estimate))))
     return times
 
 
@@ -177,16 +183,16 @@ def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], Non
     }
 
 
-def measure_env(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
+def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
     """Whole environment steps of every peer, then gradient steps of TDC beside its matrix products."""
     models = make_models(env_id)
     for model in models.values():
         model.learn(340)
     learn = {name: lambda n, model=model: model.learn(n, reset_num_timesteps=False) for name, model in models.items()}
     with Load() as load:
-        step_times = time_calls(learn, rounds, steps)
+        step_times = time_calls(learn, rounds, seconds)
         tdc = models["TDC"]
-        gradient_times = time_calls(gradient_steps(tdc, 256), 4 * rounds, 20)
+        gradient_times = time_calls(gradient_steps(tdc, 256), 4 * rounds, seconds / 2)
     return {
         "steps": step_times,
         "gradient": gradient_times,
@@ -226,11 +232,7 @@ def measure_scaling(rounds: int) -> dict[str, Any]:
             seed=0,
         ).learn(300)
         model.train(2, batch_size)
-        functions = gradient_steps(model, batch_size)
-        start = time.perf_counter()
-        model.train(2, batch_size)
-        calls = max(2, min(20, int(0.2 / (time.perf_counter() - start))))
-        return time_calls(functions, rounds, calls)
+        return time_calls(gradient_steps(model, batch_size), rounds, seconds=0.2)
 
     with Load() as load:
         result: dict[str, Any] = {
@@ -246,7 +248,7 @@ def run_child(task: str, threads: int, arguments: argparse.Namespace) -> dict[st
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {**os.environ, **dict.fromkeys(names, str(threads)), "JAX_PLATFORMS": "cpu", "TQDM_DISABLE": "1"}
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.speed", "--task", task, "--threads", str(threads)]
-    command += ["--rounds", str(arguments.rounds), "--steps", str(arguments.steps)]
+    command += ["--rounds", str(arguments.rounds), "--seconds", str(arguments.seconds)]
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -308,7 +310,7 @@ def work(arguments: argparse.Namespace) -> None:
     if arguments.task == "scaling":
         result = measure_scaling(arguments.rounds)
     else:
-        result = measure_env(arguments.task, arguments.rounds, arguments.steps)
+        result = measure_env(arguments.task, arguments.rounds, arguments.seconds)
     print(json.dumps(result))
 
 
@@ -326,8 +328,8 @@ def hardware() -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"), help="folder of table and plots")
-    parser.add_argument("--rounds", type=int, default=8, help="turns of every peer")
-    parser.add_argument("--steps", type=int, default=25, help="environment steps a turn")
+    parser.add_argument("--rounds", type=int, default=6, help="turns of every peer")
+    parser.add_argument("--seconds", type=float, default=0.5, help="length of a turn")
     parser.add_argument("--envs", nargs="+", default=ENVS)
     parser.add_argument("--task", help=argparse.SUPPRESS)
     parser.add_argument("--threads", type=int, nargs="+", default=[2, 1])
@@ -340,7 +342,8 @@ def main() -> None:
     from benchmarks.report import write_report
 
     start = time.perf_counter()
-    results: dict[str, Any] = {"hardware": hardware(), "rounds": arguments.rounds, "steps": arguments.steps, "envs": {}}
+    results: dict[str, Any] = {"hardware": hardware(), "rounds": arguments.rounds, "seconds": arguments.seconds}
+    results["envs"] = {}
     for env_id in arguments.envs:
         for threads in arguments.threads:
             print(f"{env_id}, {threads} thread(s) ...", file=sys.stderr, flush=True)
