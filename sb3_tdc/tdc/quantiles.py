@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import torch as th
 from torch.autograd.function import once_differentiable
 
-# The all-pairs differences of one chunk of rows: this many floats (4 MiB). Smaller chunks cost more calls, larger ones
+# The all-pairs differences of one chunk of rows: this many floats (1 MiB). Smaller chunks cost more calls, larger ones
 # gain nothing.
-_CHUNK_ELEMENTS = 2**20
+_CHUNK_ELEMENTS = 2**18
 
 
 def quantile_midpoints(n_quantiles: int, device: th.device | str = "cpu") -> th.Tensor:

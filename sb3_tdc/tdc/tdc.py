@@ -281,7 +281,8 @@ class TDC(OffPolicyAlgorithm):
         initial = th.tensor([self._initial_ent_coef()], device=self.device)
         if self._learns_ent_coef:
             self.log_ent_coef = initial.log().requires_grad_(True)
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self._scheduled("learning_rate"))
+            learning_rate = self._scheduled("learning_rate")
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=learning_rate, fused=True)
         else:
             self.ent_coef_tensor = initial
 
@@ -395,9 +396,11 @@ class TDC(OffPolicyAlgorithm):
         """
         self.diagnose(actor_loss=actor_loss, entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
         if self._learns_ent_coef:
-            ent_coef_loss = -(self.log_ent_coef * (log_prob + self._target_entropy)).mean()
-            self._minimize(ent_coef_loss, self.ent_coef_optimizer)
-            self.diagnose(ent_coef_loss=ent_coef_loss.detach())
+            # The loss −log α·mean(log π + H_target) is linear in log α
+            slope = -(log_prob + self._target_entropy).mean(dim=0, keepdim=True)
+            self.diagnose(ent_coef_loss=(self.log_ent_coef.detach() * slope).squeeze())
+            self.log_ent_coef.grad = slope
+            self.ent_coef_optimizer.step()
 
     @staticmethod
     def _minimize(output: th.Tensor, optimizer: th.optim.Optimizer, slope: th.Tensor | None = None) -> None:
