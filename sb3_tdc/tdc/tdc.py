@@ -395,7 +395,7 @@ class TDC(OffPolicyAlgorithm):
         :param actor_loss: scalar, for the log
         """
         self.diagnose(actor_loss=actor_loss, entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
-        if self._learns_ent_coef:
+        if self._learns_ent_coef and self.log_ent_coef.requires_grad:
             # The loss −log α·mean(log π + H_target) is linear in log α
             slope = -(log_prob + self._target_entropy).mean(dim=0, keepdim=True)
             self.diagnose(ent_coef_loss=(self.log_ent_coef.detach() * slope).squeeze())
@@ -407,12 +407,11 @@ class TDC(OffPolicyAlgorithm):
         """One step down a loss: the output, or what has this slope at the output."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         learning = [parameter for parameter in parameters if parameter.requires_grad]
-        # Gradients of these parameters alone: others stay as they are, and cost nothing
-        gradients = th.autograd.grad(output, learning, slope, allow_unused=True) if learning else ()
         for parameter in parameters:
             parameter.grad = None
-        for parameter, gradient in zip(learning, gradients, strict=True):
-            parameter.grad = gradient
+        # Gradients of these parameters alone: others stay as they are, and cost nothing
+        if learning:
+            output.backward(slope, inputs=learning)
         optimizer.step()
 
     @th.no_grad()

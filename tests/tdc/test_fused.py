@@ -147,6 +147,19 @@ def test_replaced_parameters_are_noticed():
     assert any(
         not th.equal(before[name], weight) for name, weight in weights(model).items() if name.startswith("actor.")
     )
+    bound = model._fused_update
+    model.critic.optimizer.state[model.critic.layers[0].weight] = {}
+    model.train(gradient_steps=1, batch_size=16)
+    assert model._fused_update is not bound
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_frozen_temperature_stays(fused):
+    model = make(stochastic_actor=True, fused=fused).learn(60)
+    model.log_ent_coef.requires_grad_(False)
+    before = model.log_ent_coef.clone()
+    model.train(gradient_steps=4, batch_size=16)
+    assert th.equal(model.log_ent_coef, before)
 
 
 def test_another_batch_size_is_another_update():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import nn
 
 from sb3_tdc import TDC
 from tests.tdc.reference import Reference
@@ -191,6 +192,24 @@ def test_actor_step_leaves_no_gradient_in_the_critics():
     model.train(gradient_steps=1, batch_size=BATCH)
     half = len(gradients) // 2
     assert all(th.equal(a, b) for a, b in zip(gradients[:half], gradients[half:], strict=True))
+
+
+def test_gradients_lie_in_memory_as_their_parameters_do():
+    """Which is not how a transposed product computes them, and which the fused Adam takes for granted."""
+    inputs, start = th.randn(2, 5, 4), th.randn(2, 3, 4)
+
+    def transposed_product(weight):
+        return th.bmm(inputs, weight.transpose(1, 2)).square().sum()
+
+    expected, weight = (nn.Parameter(start.clone()) for _ in range(2))
+    plain = th.optim.Adam([expected], lr=0.1, foreach=False)
+    fused = th.optim.Adam([weight], lr=0.1, fused=True)
+    for _ in range(3):
+        plain.zero_grad()
+        transposed_product(expected).backward()
+        plain.step()
+        TDC._minimize(transposed_product(weight), fused)
+    th.testing.assert_close(weight, expected)
 
 
 def _gradients(module):

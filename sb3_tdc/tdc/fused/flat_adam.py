@@ -58,7 +58,7 @@ class FlatAdam:
         for p, value, target, target_value, mean in self.owned:
             if p.data_ptr() != value or target.data_ptr() != target_value or not p.requires_grad:
                 return False
-            if p not in state or state[p]["exp_avg"] is not mean:
+            if p not in state or state[p].get("exp_avg") is not mean:
                 return False
         return True
 

@@ -58,11 +58,10 @@ class PackedReplay:
 
     def holds(self, buffer: ReplayBuffer) -> bool:
         """:return: whether this is the buffer, SB3 still samples it, and its arrays are still parts of the rows"""
-        attributes, slots = vars(buffer), self.slots
         return (
             self.buffer is buffer
-            and all(attributes[name].base is slots for name in _ARRAYS)
-            and not _METHODS & attributes.keys()
+            and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)
+            and not _METHODS & vars(buffer).keys()
         )
 
     def sample(self, out: th.Tensor, steps: int) -> None:
