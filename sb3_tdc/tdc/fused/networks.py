@@ -83,7 +83,7 @@ class Mlp:
         stacked = layers[0].weight.shape[:-2]
         if outputs is None:
             outputs = [inputs.new_empty(*stacked, len(inputs), layer.bias.shape[-1]) for layer in layers]
-        self.layers, self.outputs = layers, outputs
+        self.outputs = outputs
         self.slopes = [th.empty_like(output) for output in outputs] if slopes is None else slopes
         # Both passes with all their tensors, so that none is looked up or viewed again
         all_inputs = [inputs.expand(*stacked, -1, -1), *outputs[:-1]]
