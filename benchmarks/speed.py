@@ -88,24 +88,16 @@ def _optional(name: str) -> Any:
 
 def matrix_products(model: Any) -> Callable[[], None]:
     """:return: a function that computes the matrix products of one gradient step, and nothing else"""
-    import torch as th
-
     fused = model._fused_update
-    slopes = th.randn_like(fused.critic.outputs[-1]), th.randn_like(fused.value.outputs[-1])
-    action_slope = th.randn_like(fused.noise)
     calls = 0
 
     def forward(network: Any) -> None:
-        for layer, inputs, output, _ in network.forward_steps:
-            layer.affine(layer.bias, inputs, layer.weight, out=output)
+        for product in network.products:
+            product()
 
-    def backward(network: Any, slope: Any) -> Any:
-        for layer, gradient, _, transposed_inputs, slope_below in network.backward_steps:
-            if gradient is not None:
-                layer.matmul(transposed_inputs, slope, out=gradient.weight)
-            if slope_below is not None:
-                slope = layer.matmul(slope, layer.transposed, out=slope_below)
-        return slope
+    def backward(network: Any) -> None:
+        for product in (*network.weight_products, *network.slope_products):
+            product()
 
     def run() -> None:
         nonlocal calls
@@ -113,12 +105,13 @@ def matrix_products(model: Any) -> Callable[[], None]:
         forward(fused.target_head.network)
         forward(fused.critic_target)
         forward(fused.critic)
-        backward(fused.critic, slopes[0])
+        backward(fused.critic)
         if calls % model.policy_delay == 0:
             forward(fused.head.network)
             forward(fused.value)
-            backward(fused.value, slopes[1]) @ fused.action_weight
-            backward(fused.head.network, action_slope)
+            backward(fused.value)
+            fused.value.slopes[0] @ fused.action_weight
+            backward(fused.head.network)
 
     return run
 

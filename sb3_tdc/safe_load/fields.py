@@ -110,7 +110,6 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     "target_entropy": _or_none(_text_or_number),
     "seed": _or_none(integer(0)),
     "fused": _or_none(boolean),
-    "fused_kwargs": _arguments,
     "verbose": integer(0, 2),
     "n_envs": integer(1, MAX_ENVS),
     **dict.fromkeys(("gradient_steps", "sde_sample_freq"), integer(-1)),

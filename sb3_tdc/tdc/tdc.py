@@ -17,8 +17,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 
 from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
+from sb3_tdc.tdc.compiled import numba_version
 from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
-from sb3_tdc.tdc.fused import FusedUpdate, check_options, obstacles
+from sb3_tdc.tdc.fused import FusedUpdate, obstacles
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -73,8 +74,6 @@ class TDC(OffPolicyAlgorithm):
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
     :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
         observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
-    :param fused_kwargs: what it may do besides, each True or False: ``bfloat16`` (products between hidden layers of
-        factors rounded to bfloat16), ``compile_loss`` (the gradient of the loss by ``torch.compile``)
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
@@ -121,7 +120,6 @@ class TDC(OffPolicyAlgorithm):
         ent_coef: str | float = "auto",
         target_entropy: str | float = "auto",
         fused: bool | None = None,
-        fused_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -169,7 +167,6 @@ class TDC(OffPolicyAlgorithm):
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.fused = fused
-        self.fused_kwargs = dict(fused_kwargs or {})
 
         if _init_setup_model:
             self._setup_model()
@@ -197,7 +194,6 @@ class TDC(OffPolicyAlgorithm):
         saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
-        check_options(self.fused_kwargs)
         self._convert_train_freq()
 
     def _initial_ent_coef(self) -> float:
@@ -266,11 +262,13 @@ class TDC(OffPolicyAlgorithm):
     def _setup_fused_update(self) -> None:
         self._fused_update: FusedUpdate | None = None
         self._obstacles = obstacles(self)
-        if self._obstacles and (self.fused or self.fused_kwargs):
+        if self._obstacles and self.fused:
             raise ValueError(self._obstacle_message())
         if self.verbose > 0 and self.fused is None:
-            reason = f" ({'; '.join(self._obstacles)})" if self._obstacles else ""
-            print(f"Using the {'readable' if reason else 'fused'} update{reason}")
+            update = f"readable update ({'; '.join(self._obstacles)})" if self._obstacles else "fused update"
+            numba = numba_version()
+            loops = f"loops compiled by Numba {numba}" if numba else 'no compiled loops: pip install "sb3-tdc[fast]"'
+            print(f"Using the {update}, {loops}")
 
     def _setup_temperature(self) -> None:
         self._target_entropy = (
@@ -340,8 +338,7 @@ class TDC(OffPolicyAlgorithm):
         return self._fused_update
 
     def _obstacle_message(self) -> str:
-        allowed = "fused must be None or False" if self.fused else "fused_kwargs must be empty"
-        return f"{allowed} here: {'; '.join(self._obstacles)}"
+        return f"fused must be None or False here: {'; '.join(self._obstacles)}"
 
     def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
         """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""

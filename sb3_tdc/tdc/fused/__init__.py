@@ -6,7 +6,7 @@ that an optimizer step and a Polyak step are one call each. What is computed is 
 ``TDC.update_actor`` to float32 rounding, on the same random numbers; the backward passes are derived by hand.
 """
 
-from sb3_tdc.tdc.fused.applicability import check_options, obstacles
+from sb3_tdc.tdc.fused.applicability import obstacles
 from sb3_tdc.tdc.fused.update import FusedUpdate
 
-__all__ = ["FusedUpdate", "check_options", "obstacles"]
+__all__ = ["FusedUpdate", "obstacles"]

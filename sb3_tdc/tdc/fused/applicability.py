@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 # What a subclass of TDC may override, and then expects to be called
 _METHODS = ("train", "update_critics", "update_actor", "update_targets", "_sample_target_actions")
-_OPTIONS = ("bfloat16", "compile_loss")
 _CLASSES = (TDCPolicy, DeterministicActor, TanhGaussianActor, QuantileCritic)
 
 
@@ -66,12 +65,3 @@ def hooks(network: nn.Module) -> list[dict[int, Any]]:
         for m in network.modules()
         for kept in (m._forward_hooks, m._forward_pre_hooks, m._backward_hooks, m._backward_pre_hooks)
     ]
-
-
-def check_options(fused_kwargs: dict[str, Any]) -> None:
-    """:raises ValueError: for an option of the fused update that is not one"""
-    for name, value in fused_kwargs.items():
-        if name not in _OPTIONS:
-            raise ValueError(f"fused_kwargs may have {', '.join(_OPTIONS)}, got {name!r}")
-        if not isinstance(value, bool):
-            raise ValueError(f"fused_kwargs[{name!r}] must be True or False, got {value!r}")
