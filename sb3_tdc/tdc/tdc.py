@@ -15,6 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
+from torch import nn
 
 from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
 from sb3_tdc.tdc.compiled import numba_version
@@ -236,14 +237,6 @@ class TDC(OffPolicyAlgorithm):
         self._built_stochastic_actor = self.stochastic_actor
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
-        # With a shared features extractor the actor and the critics have parameters in common: Polyak moves them once
-        self._online_parameters = _unique([*self.critic.parameters(), *self.actor.parameters()])
-        self._target_parameters = _unique([*self.critic_target.parameters(), *self.actor_target.parameters()])
-        # Running statistics of batch norm
-        self._online_statistics, self._target_statistics = (
-            [tensor for network in networks for tensor in get_parameters_by_name(network, ["running_"])]
-            for networks in ((self.critic, self.actor), (self.critic_target, self.actor_target))
-        )
         self._diagnostics = Diagnostics()
         self._setup_fused_update()
         if self.stochastic_actor:
@@ -265,10 +258,13 @@ class TDC(OffPolicyAlgorithm):
         if self._obstacles and self.fused:
             raise ValueError(self._obstacle_message())
         if self.verbose > 0 and self.fused is None:
-            update = f"readable update ({'; '.join(self._obstacles)})" if self._obstacles else "fused update"
-            numba = numba_version()
-            loops = f"loops compiled by Numba {numba}" if numba else 'no compiled loops: pip install "sb3-tdc[fast]"'
-            print(f"Using the {update}, {loops}")
+            self._tell_which_update()
+
+    def _tell_which_update(self) -> None:
+        update = f"readable update ({'; '.join(self._obstacles)})" if self._obstacles else "fused update"
+        numba = numba_version()
+        loops = f"loops compiled by Numba {numba}" if numba else 'no compiled loops: pip install "sb3-tdc[fast]"'
+        print(f"Using the {update}, {loops}")
 
     def _setup_temperature(self) -> None:
         self._target_entropy = (
@@ -323,19 +319,26 @@ class TDC(OffPolicyAlgorithm):
             update_learning_rate(self.ent_coef_optimizer, learning_rate)
 
     def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
-        """The same update on static buffers, where it applies; it is made anew when the parameters were replaced."""
+        """The same update on preallocated buffers, where it applies; it is made anew when anything has changed."""
         bound = self._fused_update
         if bound is not None and self.fused is not False and bound.fits(batch_size):
             return bound
         self._fused_update = None
-        if self.fused is False or (bound is None and self._obstacles):
+        if self.fused is False:
             return None
-        self._obstacles = obstacles(self)  # again: optimizers and networks can be replaced by their owner
+        known, self._obstacles = self._obstacles, obstacles(self)
         if not self._obstacles:
             self._fused_update = FusedUpdate(self, batch_size, bound.packed_replay if bound is not None else None)
         elif self.fused:
             raise ValueError(self._obstacle_message())
+        if self.verbose > 0 and known != self._obstacles:
+            self._tell_which_update()
         return self._fused_update
+
+    def overridden_methods(self) -> list[str]:
+        """Return the methods, replaced on the class or on this instance, that the fused update would not call."""
+        cls, attributes = type(self), vars(self)
+        return [name for name, own in _FUSED_METHODS.items() if getattr(cls, name) is not own or name in attributes]
 
     def _obstacle_message(self) -> str:
         return f"fused must be None or False here: {'; '.join(self._obstacles)}"
@@ -414,9 +417,12 @@ class TDC(OffPolicyAlgorithm):
     @th.no_grad()
     def update_targets(self) -> None:
         """Polyak averaging of critics and actor (Eq. 16)."""
-        th._foreach_lerp_(self._target_parameters, self._online_parameters, self.tau)
-        for target, online in zip(self._target_statistics, self._online_statistics, strict=True):
-            target.copy_(online)
+        online, target = (self.critic, self.actor), (self.critic_target, self.actor_target)
+        th._foreach_lerp_(_parameters(target), _parameters(online), self.tau)
+        for of_online, of_target in zip(online, target, strict=True):  # the running statistics of batch norm
+            pairs = (get_parameters_by_name(network, ["running_"]) for network in (of_target, of_online))
+            for statistic, source in zip(*pairs, strict=True):
+                statistic.copy_(source)
 
     # ---------------------------------------------------------------- logging
 
@@ -460,7 +466,7 @@ class TDC(OffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         fused = self._fused_update
-        if fused is None or self.num_timesteps < learning_starts or not fused.actor_adam.owns_parameters():
+        if fused is None or self.num_timesteps < learning_starts or not fused.acts():
             return super()._sample_action(learning_starts, action_noise, n_envs)
         assert isinstance(self._last_obs, np.ndarray)
         scaled_action = fused.act(self._last_obs).reshape(-1, *self.action_space.shape)  # type: ignore[misc]
@@ -529,8 +535,7 @@ class TDC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_online_parameters", "_target_parameters", "_online_statistics", "_target_statistics"]
-        return [*super()._excluded_save_params(), *networks, *derived, "_diagnostics", "_fused_update"]
+        return [*super()._excluded_save_params(), *networks, "_obstacles", "_diagnostics", "_fused_update"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
@@ -541,5 +546,16 @@ class TDC(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_ent_coef"]
 
 
-def _unique(parameters: list[th.nn.Parameter]) -> list[th.Tensor]:
-    return list({id(parameter): parameter for parameter in parameters}.values())
+def _parameters(networks: tuple[nn.Module, ...]) -> list[th.Tensor]:
+    """The parameters of networks, each once: actor and critics have those of a shared features extractor in common."""
+    return list({id(parameter): parameter for network in networks for parameter in network.parameters()}.values())
+
+
+# Methods whose work the fused update does itself
+_FUSED_METHODS = {
+    name: getattr(TDC, name)
+    for name in (
+        *("train", "update_critics", "update_actor", "update_targets"),
+        *("_sample_target_actions", "_minimize", "predict"),
+    )
+}

@@ -185,14 +185,20 @@ def test_policies_can_be_copied_and_saved(tmp_path):
 @pytest.mark.parametrize(
     ("kwargs", "reason"),
     [
-        ({"policy_kwargs": {"activation_fn": nn.Tanh}}, "the activation is Tanh, not ReLU"),
-        ({"policy_kwargs": {"optimizer_class": th.optim.SGD}}, "an optimizer is not a plain Adam .*SGD"),
+        (
+            {"policy_kwargs": {"activation_fn": nn.Tanh}},
+            "the actor's layers are not linear ones with ReLU between them: .*Tanh",
+        ),
+        ({"policy_kwargs": {"optimizer_class": th.optim.SGD}}, "the actor's optimizer is not a plain Adam: SGD"),
         (
             {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}},
-            "an optimizer is not a plain Adam .*weight_decay",
+            "the actor's optimizer is not a plain Adam: Adam with .*weight_decay",
         ),
-        ({"policy_kwargs": {"net_arch": []}}, "a network has no hidden layer"),
-        ({"policy_kwargs": {"features_extractor_class": BatchNormExtractor}}, "the features extractor is BatchNorm"),
+        ({"policy_kwargs": {"net_arch": []}}, "the actor's layers are not linear ones with ReLU between them"),
+        (
+            {"policy_kwargs": {"features_extractor_class": BatchNormExtractor}},
+            "the actor's features extractor is BatchNormExtractor",
+        ),
     ],
     ids=str,
 )
@@ -240,7 +246,7 @@ def test_what_a_user_overrides_is_called(monkeypatch):
     model = Counting("MlpPolicy", "Pendulum-v1", learning_starts=40, policy_kwargs=SMALL, device="cpu").learn(60)
     assert (Counting.calls, model._obstacles) == (model._n_updates // 2, ["update_actor is overridden"])
     own = TDC(OwnPolicy, "Pendulum-v1", learning_starts=40, policy_kwargs=SMALL, device="cpu").learn(60)
-    assert own._obstacles == ["OwnPolicy is a class of its own"]
+    assert own._obstacles == ["OwnPolicy is a custom class"]
 
 
 def replace_optimizer(model):

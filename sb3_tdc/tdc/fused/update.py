@@ -10,13 +10,13 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.tdc.compiled import load_kernels
 from sb3_tdc.tdc.fused import passes
-from sb3_tdc.tdc.fused.applicability import hooks
-from sb3_tdc.tdc.fused.flat_adam import FlatAdam
+from sb3_tdc.tdc.fused.adam import AdamStep
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
 from sb3_tdc.tdc.fused.networks import DeterministicHead, Layer, Mlp, TanhGaussianHead, make_layers
 from sb3_tdc.tdc.fused.passes import Passes
 from sb3_tdc.tdc.fused.replay import PackedReplay, row_widths
 from sb3_tdc.tdc.fused.scalar import Scalar
+from sb3_tdc.tdc.fused.snapshot import ModuleSnapshot, Snapshot
 from sb3_tdc.tdc.quantiles import Target
 
 if TYPE_CHECKING:
@@ -40,9 +40,9 @@ class FusedUpdate:
 
     def __init__(self, model: "TDC", batch_size: int, packed_replay: PackedReplay | None = None):
         self.model, self.batch_size = model, batch_size
-        self.hooks = hooks(model.policy)
-        self.critic_adam = FlatAdam(model.critic, model.critic_target)
-        self.actor_adam = FlatAdam(model.actor, model.actor_target)
+        self.critic_adam = AdamStep(model.critic, model.critic_target)
+        self.actor_adam = AdamStep(model.actor, model.actor_target)
+        self.snapshot, self.actor_snapshot = Snapshot(model), ModuleSnapshot(model.actor.modules())
         self.constants = self._read_constants()
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
         self.packed_replay = packed_replay
@@ -111,28 +111,24 @@ class FusedUpdate:
             self.smooth = bind(passes.smooth_actions, self.noise, self.next_actions)
 
     @staticmethod
-    def _networks(adam: FlatAdam) -> list[list[Layer]]:
+    def _networks(adam: AdamStep) -> list[list[Layer]]:
         """Return the layers of the online network, of the target, and of the gradient."""
-        return [make_layers(adam.views(flat)) for flat in (adam.value, adam.target, adam.gradient)]
+        return [make_layers(tensors) for tensors in (adam.values, adam.targets, adam.gradients)]
 
     def _read_constants(self) -> tuple[Any, ...]:
         """What is read from Python in a part of an update, and so stays as it was in a CUDA graph."""
         model = self.model
-        groups = [adam.optimizer.param_groups[0] for adam in (self.critic_adam, self.actor_adam)]
-        return (
-            *(model.kappa, model.tau, model.target_policy_noise, model.target_noise_clip),
-            *((group["betas"], group["eps"]) for group in groups),
-        )
+        return model.kappa, model.tau, model.target_policy_noise, model.target_noise_clip
 
     def fits(self, batch_size: int) -> bool:
-        """:return: whether the buffers are of this size, and all that :func:`obstacles` looks at is as it was"""
-        return (
-            batch_size == self.batch_size
-            and self.critic_adam.owns_parameters()
-            and self.actor_adam.owns_parameters()
-            and self.constants == self._read_constants()
-            and not any(self.hooks)
-        )
+        """Return whether the buffers are of this size, and all that an update relies on is as it was."""
+        return batch_size == self.batch_size and self.constants == self._read_constants() and self.snapshot.is_current()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> None:
+        """Return None: a copy of the model binds an update to its own networks."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()  # and so does one that was pickled
 
     def sample(self, batch_size: int) -> ReplayBufferSamples:
         """:return: a minibatch of the model's replay buffer; of a packed one, overwritten by the next"""
@@ -159,6 +155,11 @@ class FusedUpdate:
         next_observations = self.drawn_next_observations, batch.next_observations
         return self.bind(passes.gather, packed.rows, self.rows, *next_observations, batch.dones, self.timeouts)
 
+    def acts(self) -> bool:
+        """Return whether :meth:`act` is what the policy does."""
+        model = self.model
+        return model.policy.actor is self.snapshot.networks[0] and self.actor_snapshot.is_current()
+
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
         :param observations: (n, D)
@@ -183,6 +184,7 @@ class FusedUpdate:
         else:
             self.discounts.copy_(discounts)
         self.run(self._update_critics)
+        self.critic_adam.show_gradients()
         if model.diagnoses_critics:
             model.diagnose_critics(self.critic.outputs[-1].transpose(0, 1), self.target)
 
@@ -205,6 +207,7 @@ class FusedUpdate:
         """``TDC.update_actor``, on the observations of the critics' update"""
         model = self.model
         self.actor_adam.read_learning_rate()
+        self.actor_adam.show_gradients()
         if not model.stochastic_actor:
             model.diagnose(actor_loss=self.run(self._update_deterministic_actor).clone())
             return
