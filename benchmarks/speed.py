@@ -164,10 +164,13 @@ def repeat(function: Callable[[], Any]) -> Callable[[int], None]:
 
 
 def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], None]]:
-    """Return by name, for :func:`time_calls`: those of a model, without the comparison, and the matrix products of one."""
+    """
+    Return functions for :func:`time_calls`, by name: the gradient steps of a model, the same without the comparison of
+    everything they rely on, and the matrix products of one.
+    """
 
     def train_unchecked(n: int) -> None:
-        with mock.patch.object(type(model._fused_update), "fits", lambda *_: True):
+        with mock.patch.object(type(model._fused_update), "fits", return_value=True):
             for _ in range(n):
                 model.train(1, batch_size)
 
@@ -182,11 +185,8 @@ def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
     """Whole environment steps of every peer, then gradient steps of TDC beside its matrix products."""
     models = make_models(env_id)
     for name, model in models.items():
-        with (
-            mock.patch("sb3_tdc.tdc.fused.update.load_kernels", lambda: None)
-            if name == WITHOUT_NUMBA
-            else nullcontext()
-        ):
+        without_numba = mock.patch("sb3_tdc.tdc.fused.update.load_kernels", return_value=None)
+        with without_numba if name == WITHOUT_NUMBA else nullcontext():
             model.learn(340)
     learn = {name: lambda n, model=model: model.learn(n, reset_num_timesteps=False) for name, model in models.items()}
     with Load() as load:
