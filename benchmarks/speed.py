@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -169,8 +169,11 @@ def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], Non
     everything they rely on, and the matrix products of one.
     """
 
+    def fits(*_: Any) -> bool:
+        return True
+
     def train_unchecked(n: int) -> None:
-        with mock.patch.object(type(model._fused_update), "fits", return_value=True):
+        with mock.patch.object(type(model._fused_update), "fits", fits):
             for _ in range(n):
                 model.train(1, batch_size)
 
@@ -181,14 +184,24 @@ def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], Non
     }
 
 
+def learn_steps(name: str, model: Any) -> Callable[[int], None]:
+    """Return a function that trains a model for a number of steps."""
+
+    def learn(n: int) -> None:
+        with ExitStack() as stack:
+            for place in ("quantiles", "fused.update") if name == WITHOUT_NUMBA else ():
+                stack.enter_context(mock.patch(f"sb3_tdc.tdc.{place}.load_kernels", return_value=None))
+            model.learn(n, reset_num_timesteps=False)
+
+    return learn
+
+
 def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
     """Whole environment steps of every peer, then gradient steps of TDC beside its matrix products."""
     models = make_models(env_id)
-    for name, model in models.items():
-        without_numba = mock.patch("sb3_tdc.tdc.fused.update.load_kernels", return_value=None)
-        with without_numba if name == WITHOUT_NUMBA else nullcontext():
-            model.learn(340)
-    learn = {name: lambda n, model=model: model.learn(n, reset_num_timesteps=False) for name, model in models.items()}
+    learn = {name: learn_steps(name, model) for name, model in models.items()}
+    for function in learn.values():
+        function(340)
     with Load() as load:
         step_times = time_calls(learn, rounds, seconds)
         tdc = models["TDC"]

@@ -34,6 +34,10 @@ SelfTDC = TypeVar("SelfTDC", bound="TDC")
 # The critics' diagnostics (docs/tdc.md) are taken at every fiftieth update: at every one they would slow it down
 DIAGNOSTICS_INTERVAL = 50
 
+# Where the gradient stays zero (dead ReLUs), Adam's moments decay into denormal numbers and never leave them: 0.9 times
+# the smallest one is rounded to itself. Intel's processors compute with them many times slower. Next to ε they are 0
+FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
+
 
 class TDC(OffPolicyAlgorithm):
     """
@@ -310,6 +314,17 @@ class TDC(OffPolicyAlgorithm):
             if self._n_updates % self.policy_delay == 0:
                 update.update_actor(replay_data)
                 update.update_targets()
+            if self._n_updates % FLUSH_INTERVAL == 0:
+                self._flush_moments()
+
+    def _flush_moments(self) -> None:
+        """Set moments of Adam to zero that are about to become denormal numbers."""
+        optimizers: list[Any] = [self.actor.optimizer, self.critic.optimizer]
+        if self.stochastic_actor and self._learns_ent_coef:
+            optimizers.append(self.ent_coef_optimizer)
+        for state in (state for optimizer in optimizers for state in optimizer.state.values()):
+            for moment in (state[name] for name in ("exp_avg", "exp_avg_sq") if name in state):
+                moment.masked_fill_(moment.abs() < SMALLEST_MOMENT, 0)
 
     def _update_learning_rates(self) -> None:
         learning_rate = self._scheduled("learning_rate")

@@ -313,3 +313,28 @@ def test_a_buffer_that_returns_fewer_transitions():
     before = weights(model)
     model.train(gradient_steps=3, batch_size=16)
     assert any(not th.equal(before[name], weight) for name, weight in weights(model).items())
+
+
+@HEADS
+@pytest.mark.parametrize("fused", [False, True])
+def test_moments_about_to_be_denormal_become_zero(stochastic_actor, fused, monkeypatch):
+    """At the same update of both paths; all others stay, a NaN too."""
+    monkeypatch.setattr("sb3_tdc.tdc.tdc.FLUSH_INTERVAL", 4)
+    model = make_model(stochastic_actor=stochastic_actor, fused=fused)
+    model.replay_buffer = BatchQueue(random_batches(6, batch=8))
+    model.train(gradient_steps=3, batch_size=8)
+    planted = {}
+    for optimizer in (model.actor.optimizer, model.critic.optimizer):
+        for group in optimizer.param_groups:
+            group["lr"] = 0.0
+        moment = next(iter(optimizer.state.values()))["exp_avg"].view(-1)
+        moment[:5] = th.tensor([1e-38, -1e-36, 1e-22, -1e-45, float("nan")])
+        planted[optimizer] = moment
+    model._flush_moments()
+    for moment in planted.values():
+        assert [x == 0 for x in moment[:5].tolist()] == [True, True, False, True, False]
+        moment[4] = 0.0
+    calls = []
+    monkeypatch.setattr(model, "_flush_moments", lambda: calls.append(model._n_updates))
+    model.train(gradient_steps=3, batch_size=8)
+    assert calls == [4]

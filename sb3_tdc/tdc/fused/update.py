@@ -102,6 +102,11 @@ class FusedUpdate:
         batch, bind = self.minibatch, self.bind
         online, target, gradient = self._networks(self.actor_adam)
         self.mean_layers = online[:-1] if self.model.stochastic_actor else online
+        if bind.kernels is not None:
+            self.mean_rows = [
+                (layer.weight.mT.numpy(), layer.bias[0].numpy(), np.empty(layer.bias.shape[1], np.float32))
+                for layer in self.mean_layers
+            ]
         if self.model.stochastic_actor:
             self.head: Any = TanhGaussianHead(online, batch.observations, batch.actions, bind, gradient, self.ent_coef)
             self.target_head: Any = TanhGaussianHead(target, batch.next_observations, self.next_actions, bind)
@@ -165,11 +170,20 @@ class FusedUpdate:
         :param observations: (n, D)
         :return: (n, A), the mean actions in [-1, 1]
         """
-        hidden = th.as_tensor(np.asarray(observations, dtype=np.float32), device=self.model.device)
+        hidden = np.ascontiguousarray(observations, dtype=np.float32)
+        if len(hidden) == 1 and self.bind.kernels is not None:
+            return self._act_once(self.bind.kernels.affine_row, hidden[0])
         *hidden_layers, output = self.mean_layers
+        outputs = th.as_tensor(hidden, device=self.model.device)
         for layer in hidden_layers:
-            hidden = th.addmm(layer.bias, hidden, layer.weight).relu_()
-        return th.addmm(output.bias, hidden, output.weight).tanh_().cpu().numpy()
+            outputs = th.addmm(layer.bias, outputs, layer.weight).relu_()
+        return th.addmm(output.bias, outputs, output.weight).tanh_().cpu().numpy()
+
+    def _act_once(self, affine_row: Callable[..., Any], hidden: np.ndarray) -> np.ndarray:
+        for weight, bias, outputs in self.mean_rows:
+            affine_row(hidden, weight, bias, outputs, outputs is not self.mean_rows[-1][2])
+            hidden = outputs
+        return np.tanh(hidden)[None]
 
     def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
         """``TDC.update_critics``"""
