@@ -25,6 +25,8 @@ from sb3_tdc.tdc.checks import check_number
 MAX_REPLAY_BYTES = 2**36  # of the replay buffer that a loaded model gets
 MAX_CRITICS = 256
 MAX_ENVS = 10_000
+# What is made of the argument ent_coef
+TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
@@ -89,6 +91,11 @@ def _arguments(name: str, value: Any) -> dict[str, Any]:
     return value
 
 
+def _none(name: str, value: Any) -> None:
+    if value is not None:
+        raise ValueError(f"{name} must be null, got {value!r:.100}")
+
+
 def _or_none(check: Callable[[str, Any], Any]) -> Callable[[str, Any], Any]:
     return lambda name, value: None if value is None else check(name, value)
 
@@ -113,6 +120,7 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     "fused_kwargs": _arguments,
     "verbose": integer(0, 2),
     "n_envs": integer(1, MAX_ENVS),
+    **dict.fromkeys(TEMPERATURE, _none),  # where there is one, it is a tensor, and elsewhere in the file
     **dict.fromkeys(("gradient_steps", "sde_sample_freq"), integer(-1)),
     **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "policy_delay", "target_update_interval"), integer(1)),
     **dict.fromkeys(

@@ -29,9 +29,9 @@ def obstacles(model: "TDC") -> list[str]:
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
         found.append("the observations are not flat vectors")
     if policy.features_extractor_class is not FlattenExtractor:
-        found.append(f"the features extractor is {policy.features_extractor_class.__name__}")
+        found.append(f"the features extractor is {name_of(policy.features_extractor_class)}")
     if policy.activation_fn is not nn.ReLU:
-        found.append(f"the activation is {policy.activation_fn.__name__}, not ReLU")
+        found.append(f"the activation is {name_of(policy.activation_fn)}, not ReLU")
     if not all(len(arch) > 0 for arch in get_actor_critic_arch(policy.net_arch)):
         found.append("a network has no hidden layer")
     found += [f"{name} is overridden" for name in _METHODS if getattr(type(model), name) is not getattr(TDC, name)]
@@ -40,7 +40,7 @@ def obstacles(model: "TDC") -> list[str]:
     if any(hooks(policy)):
         found.append("a network has hooks")
     if not all(is_plain_adam(network.optimizer) for network in (policy.actor, policy.critic)):
-        kind = f"{policy.optimizer_class.__name__} with {policy.optimizer_kwargs}"
+        kind = f"{name_of(policy.optimizer_class)} with {policy.optimizer_kwargs}"
         found.append(f"an optimizer is not a plain Adam (the policy's: {kind})")
     if not all(p.requires_grad for network in (policy.actor, policy.critic) for p in network.parameters()):
         found.append("a parameter is frozen")
@@ -49,6 +49,11 @@ def obstacles(model: "TDC") -> list[str]:
     elif model.device.type not in ("cpu", "cuda"):
         found.append(f"the device is {model.device}")
     return found
+
+
+def name_of(make: Any) -> str:
+    """:return: how to call a class, or a function or object that stands for one"""
+    return getattr(make, "__name__", repr(make))
 
 
 def is_plain_adam(optimizer: Any) -> bool:
