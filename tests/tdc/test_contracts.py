@@ -25,6 +25,7 @@ from torch import nn
 
 from sb3_tdc import TDC, NonFiniteError, load_safely
 from sb3_tdc.safe_load import UnsafeFileError
+from sb3_tdc.tdc.checks import find_non_finite
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
 from tests.tdc.test_update import TwoActions
 
@@ -334,6 +335,13 @@ def test_an_infinite_constant_is_saved_and_loaded(tmp_path, shared):
         model.policy.load_state_dict(good)
 
 
+def test_both_names_of_a_shared_parameter_are_looked_at():
+    """A file may have other values under each; the last one would count."""
+    policy = make(policy_kwargs={"features_extractor_class": Masked, "share_features_extractor": True}).policy
+    for name in ("actor.features_extractor.norm.bias", "critic.features_extractor.norm.bias"):
+        assert find_non_finite(policy, {**policy.state_dict(), name: th.tensor([0.0, th.nan, 0.0])}) == [name]
+
+
 @FUSED
 @pytest.mark.parametrize(
     ("name", "make_part"),
@@ -360,12 +368,13 @@ def test_policies_are_copied_and_pickled_after_an_update(stochastic_actor, fused
     model = make(stochastic_actor=stochastic_actor, fused=fused)
     model.learn(20)
     model.train(2, 16)
-    model.actor(th.zeros(4, 3))  # with a graph
-    observations = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
-    expected = model.predict(observations)[0]
-    for policy in (copy.deepcopy(model.policy), pickle.loads(pickle.dumps(model.policy))):
-        assert np.array_equal(policy.predict(observations)[0], expected)
+    copies = [copy.deepcopy(model.policy)]
+    model.actor(th.zeros(4, 3))  # leaves its graph behind
+    copies += [copy.deepcopy(model.policy), pickle.loads(pickle.dumps(model.policy))]
     actor = copy.deepcopy(model.actor)
+    observations = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
+    for policy in copies:
+        assert np.array_equal(policy.predict(observations)[0], model.predict(observations)[0])
     observation = th.from_numpy(observations)
     assert th.equal(actor._predict(observation, True), model.actor._predict(observation, True))
 
