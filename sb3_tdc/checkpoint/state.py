@@ -19,6 +19,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_tdc.checkpoint.codec import Capture, Restore
 from sb3_tdc.checkpoint.replay import other_attributes
+from sb3_tdc.tdc.compiled import numba_version
 
 # Of the process, of the call of learn(), or captured on their own
 _NOT_THE_RUN = {"env", "policy", "replay_buffer", "tensorboard_log", "verbose", "start_time", "_total_timesteps"}
@@ -192,6 +193,7 @@ def describe_platform(model: OffPolicyAlgorithm) -> dict[str, str]:
         "stable_baselines3": stable_baselines3.__version__,
         "gymnasium": gym.__version__,
         "mujoco": mujoco.__version__,
+        "numba": numba_version() or "absent",
         "threads of torch": str(th.get_num_threads()),
         "device": str(model.device),
         "processor": f"{platform.machine()}, {th.backends.cpu.get_cpu_capability()}",

@@ -117,7 +117,6 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     "target_entropy": _or_none(_text_or_number),
     "seed": _or_none(integer(0)),
     "fused": _or_none(boolean),
-    "fused_kwargs": _arguments,
     "verbose": integer(0, 2),
     "n_envs": integer(1, MAX_ENVS),
     **dict.fromkeys(TEMPERATURE, _none),  # where there is one, it is a tensor, and elsewhere in the file

@@ -5,10 +5,13 @@ Shapes: ``B`` transitions of a minibatch, ``C`` critics, ``N`` quantiles. Equati
 """
 
 import math
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch as th
 from torch.autograd.function import once_differentiable
+
+from sb3_tdc.tdc.compiled import load_kernels
 
 # The all-pairs differences of one chunk of rows: this many floats (1 MiB). Smaller chunks cost more calls, larger ones
 # gain nothing.
@@ -139,13 +142,12 @@ class QuantileHuberGradient:
 
     :param current: (C, B, N), read by each call
     :param target: (B, M), read by each call
-    :param compiled: by ``torch.compile``, in one pass without the buffer (a C++ compiler is needed, and half a minute)
+    :param out: (C, B, N), where it is written, if given
     """
 
-    def __init__(self, current: th.Tensor, target: th.Tensor, compiled: bool = False):
+    def __init__(self, current: th.Tensor, target: th.Tensor, out: th.Tensor | None = None):
         (n_critics, batch_size, n_quantiles), n_targets = current.shape, target.shape[1]
-        self.current, self.target = current, target
-        self.total, self.size = th.empty_like(current), th.empty_like(current)
+        self.total, self.size = th.empty_like(current), th.empty_like(current) if out is None else out
         scale = 0.5 / (batch_size * n_quantiles * n_targets)
         self.weight = (1 - 2 * quantile_midpoints(n_quantiles, current.device).to(current.dtype)) * scale
         self.scale = scale
@@ -158,23 +160,21 @@ class QuantileHuberGradient:
             for rows in chunks
             for y, z in [(target[rows, :, None], current[critic, rows, None, :])]
         ]
-        self.compiled: Any = th.compile(self._all_pairs, dynamic=False) if compiled else None
-
-    def _all_pairs(self, current: th.Tensor, target: th.Tensor, kappa: float) -> th.Tensor:
-        delta = target[:, :, None] - current[:, :, None, :]  # (C, B, M, N), Eq. 8
-        slope = delta.clamp(-kappa, kappa) if kappa > 0 else delta.sign()
-        return slope.abs().sum(dim=2) * self.weight - slope.sum(dim=2) * self.scale
 
     def __call__(self, kappa: float) -> th.Tensor:
         """:return: (C, B, N), overwritten by the next call"""
-        if self.compiled is not None:
-            return self.compiled(self.current, self.target, kappa)
         for y, z, delta, total, size in self.chunks:
             th.sub(y, z, out=delta)  # Eq. 8
             slope = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
             th.sum(slope, dim=1, out=total)
             th.sum(slope.abs_(), dim=1, out=size)
         return self.size.mul_(self.weight).sub_(self.total, alpha=self.scale)
+
+
+def _find_kernels(*tensors: th.Tensor) -> ModuleType | None:
+    """Return the compiled loops, if there are any and they are for these tensors."""
+    fit = all(tensor.device.type == "cpu" and tensor.dtype == th.float32 for tensor in tensors)
+    return load_kernels() if fit else None
 
 
 def quantile_huber_gradient(current: th.Tensor, target: th.Tensor, kappa: float = 1.0) -> th.Tensor:
@@ -188,8 +188,14 @@ def quantile_huber_gradient(current: th.Tensor, target: th.Tensor, kappa: float 
     :raises ValueError: if the shapes do not fit
     """
     _check_shapes(current, target)
-    by_critic = current.detach().transpose(0, 1)
-    return QuantileHuberGradient(by_critic, target.detach())(kappa).transpose(0, 1)
+    by_critic, target = current.detach().transpose(0, 1).contiguous(), target.detach().contiguous()
+    kernels = _find_kernels(by_critic, target)
+    if kernels is None:
+        return QuantileHuberGradient(by_critic, target)(kappa).transpose(0, 1)
+    gradient = th.empty_like(by_critic)
+    sums = by_critic.new_empty(len(by_critic), 1, by_critic.shape[2])
+    kernels.quantile_huber_gradient(by_critic.numpy(), target.numpy(), gradient.numpy(), sums.numpy(), kappa)
+    return gradient.transpose(0, 1)
 
 
 class _QuantileHuberLoss(th.autograd.Function):
@@ -197,6 +203,9 @@ class _QuantileHuberLoss(th.autograd.Function):
     def forward(ctx: Any, current: th.Tensor, target: th.Tensor, kappa: float) -> th.Tensor:
         ctx.save_for_backward(current, target)
         ctx.kappa = kappa
+        if (kernels := _find_kernels(current, target)) is not None:
+            arrays = current.transpose(0, 1).contiguous().numpy(), target.contiguous().numpy()
+            return current.new_tensor(kernels.quantile_huber_loss(*arrays, kappa))
         rows, target_rows = current.flatten(0, 1), target.repeat_interleave(current.shape[1], dim=0)
         sums = th.empty_like(rows), th.empty_like(rows)
         chunks = _row_chunks(len(rows), rows.shape[1] * target.shape[1])

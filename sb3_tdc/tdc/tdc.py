@@ -16,10 +16,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
+from torch import nn
 
 from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number, find_non_finite
+from sb3_tdc.tdc.compiled import numba_version
 from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
-from sb3_tdc.tdc.fused import FusedUpdate, check_options, obstacles
+from sb3_tdc.tdc.fused import FusedUpdate, obstacles
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -74,8 +76,6 @@ class TDC(OffPolicyAlgorithm):
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
     :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
         observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
-    :param fused_kwargs: what it may do besides, each True or False: ``bfloat16`` (products between hidden layers of
-        factors rounded to bfloat16), ``compile_loss`` (the gradient of the loss by ``torch.compile``)
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
@@ -122,7 +122,6 @@ class TDC(OffPolicyAlgorithm):
         ent_coef: str | float = "auto",
         target_entropy: str | float = "auto",
         fused: bool | None = None,
-        fused_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -174,7 +173,6 @@ class TDC(OffPolicyAlgorithm):
         self.ent_coef_optimizer: Any = None
         self.ent_coef_tensor: Any = None
         self.fused = fused
-        self.fused_kwargs = dict(fused_kwargs or {})
 
         if _init_setup_model:
             self._setup_model()
@@ -201,7 +199,6 @@ class TDC(OffPolicyAlgorithm):
         saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
-        check_options(self.fused_kwargs)
         self._convert_train_freq()
 
     def _initial_ent_coef(self) -> float:
@@ -246,14 +243,6 @@ class TDC(OffPolicyAlgorithm):
         self._built_stochastic_actor = self.stochastic_actor
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
-        # With a shared features extractor the actor and the critics have parameters in common: Polyak moves them once
-        self._online_parameters = _unique([*self.critic.parameters(), *self.actor.parameters()])
-        self._target_parameters = _unique([*self.critic_target.parameters(), *self.actor_target.parameters()])
-        # Running statistics of batch norm
-        self._online_statistics, self._target_statistics = (
-            [tensor for network in networks for tensor in get_parameters_by_name(network, ["running_"])]
-            for networks in ((self.critic, self.actor), (self.critic_target, self.actor_target))
-        )
         self._diagnostics = Diagnostics()
         self._setup_fused_update()
         self._setup_temperature()
@@ -280,11 +269,16 @@ class TDC(OffPolicyAlgorithm):
     def _setup_fused_update(self) -> None:
         self._fused_update: FusedUpdate | None = None
         self._obstacles = obstacles(self)
-        if self._obstacles and (self.fused or self.fused_kwargs):
+        if self._obstacles and self.fused:
             raise ValueError(self._obstacle_message())
         if self.verbose > 0 and self.fused is None:
-            reason = f" ({'; '.join(self._obstacles)})" if self._obstacles else ""
-            print(f"Using the {'readable' if reason else 'fused'} update{reason}")
+            self._tell_which_update()
+
+    def _tell_which_update(self) -> None:
+        update = f"readable update ({'; '.join(self._obstacles)})" if self._obstacles else "fused update"
+        numba = numba_version()
+        loops = f"loops compiled by Numba {numba}" if numba else 'no compiled loops: pip install "sb3-tdc[fast]"'
+        print(f"Using the {update}, {loops}")
 
     def _setup_temperature(self) -> None:
         initial = th.tensor([self._initial_ent_coef()], device=self.device)
@@ -350,23 +344,29 @@ class TDC(OffPolicyAlgorithm):
             update_learning_rate(self.ent_coef_optimizer, learning_rate)
 
     def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
-        """The same update on static buffers, where it applies; it is made anew when the parameters were replaced."""
+        """The same update on preallocated buffers, where it applies; it is made anew when anything has changed."""
         bound = self._fused_update
         if bound is not None and self.fused is not False and bound.fits(batch_size):
             return bound
         self._fused_update = None
-        if self.fused is False or (bound is None and self._obstacles):
+        if self.fused is False:
             return None
-        self._obstacles = obstacles(self)  # again: optimizers and networks can be replaced by their owner
+        known, self._obstacles = self._obstacles, obstacles(self)
         if not self._obstacles:
             self._fused_update = FusedUpdate(self, batch_size, bound.packed_replay if bound is not None else None)
         elif self.fused:
             raise ValueError(self._obstacle_message())
+        if self.verbose > 0 and known != self._obstacles:
+            self._tell_which_update()
         return self._fused_update
 
+    def overridden_methods(self) -> list[str]:
+        """Return the methods, replaced on the class or on this instance, that the fused update would not call."""
+        cls, attributes = type(self), vars(self)
+        return [name for name, own in _FUSED_METHODS.items() if getattr(cls, name) is not own or name in attributes]
+
     def _obstacle_message(self) -> str:
-        allowed = "fused must be None or False" if self.fused else "fused_kwargs must be empty"
-        return f"{allowed} here: {'; '.join(self._obstacles)}"
+        return f"fused must be None or False here: {'; '.join(self._obstacles)}"
 
     def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
         """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""
@@ -442,9 +442,12 @@ class TDC(OffPolicyAlgorithm):
     @th.no_grad()
     def update_targets(self) -> None:
         """Polyak averaging of critics and actor (Eq. 16)."""
-        th._foreach_lerp_(self._target_parameters, self._online_parameters, self.tau)
-        for target, online in zip(self._target_statistics, self._online_statistics, strict=True):
-            target.copy_(online)
+        online, target = (self.critic, self.actor), (self.critic_target, self.actor_target)
+        th._foreach_lerp_(_parameters(target), _parameters(online), self.tau)
+        for of_online, of_target in zip(online, target, strict=True):  # the running statistics of batch norm
+            pairs = (get_parameters_by_name(network, ["running_"]) for network in (of_target, of_online))
+            for statistic, source in zip(*pairs, strict=True):
+                statistic.copy_(source)
 
     # ---------------------------------------------------------------- logging
 
@@ -501,7 +504,7 @@ class TDC(OffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         fused = self._fused_update
-        if fused is None or self.num_timesteps < learning_starts or not fused.actor_adam.owns_parameters():
+        if fused is None or self.num_timesteps < learning_starts or not fused.acts():
             _, scaled_action = super()._sample_action(learning_starts, None, n_envs)
         else:
             scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
@@ -605,8 +608,7 @@ class TDC(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_online_parameters", "_target_parameters", "_online_statistics", "_target_statistics"]
-        derived += ["_diagnostics", "_fused_update", "_built_ent_coef"]
+        derived = ["_obstacles", "_diagnostics", "_fused_update", "_built_ent_coef"]
         return [*super()._excluded_save_params(), *networks, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -618,5 +620,16 @@ class TDC(OffPolicyAlgorithm):
         return [*state_dicts, "ent_coef_optimizer"], ["log_ent_coef"]
 
 
-def _unique(parameters: list[th.nn.Parameter]) -> list[th.Tensor]:
-    return list({id(parameter): parameter for parameter in parameters}.values())
+def _parameters(networks: tuple[nn.Module, ...]) -> list[th.Tensor]:
+    """The parameters of networks, each once: actor and critics have those of a shared features extractor in common."""
+    return list({id(parameter): parameter for network in networks for parameter in network.parameters()}.values())
+
+
+# Methods whose work the fused update does itself
+_FUSED_METHODS = {
+    name: getattr(TDC, name)
+    for name in (
+        *("train", "update_critics", "update_actor", "update_targets"),
+        *("_sample_target_actions", "_minimize", "predict"),
+    )
+}

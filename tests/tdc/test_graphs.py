@@ -11,6 +11,7 @@ from tests.tdc.test_fused import assert_close, states
 from tests.tdc.test_tdc import HEADS, make
 from tests.tdc.test_update import BatchQueue, TwoActions, make_model, random_batches
 
+pytestmark = pytest.mark.usefixtures("torch_loops")  # as on a GPU
 WAITS = {th.ops.aten._local_scalar_dense.default, th.ops.aten.nonzero.default, th.ops.aten.equal.default}
 
 

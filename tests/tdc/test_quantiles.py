@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import arrays
 
 from sb3_tdc.tdc import quantiles as q
 
+pytestmark = pytest.mark.usefixtures("loops")
 KAPPAS = [0.0, 0.1, 1.0, 10.0]
 
 

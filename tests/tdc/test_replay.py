@@ -37,8 +37,7 @@ def make_buffer(n_envs=1, **kwargs):
 
 def draw(packed_replay, batch_size, steps):
     """As SB3 would return it."""
-    rows = th.empty(batch_size, packed_replay.slots.shape[-1])
-    packed_replay.sample(rows, steps)
+    rows = packed_replay.rows[packed_replay.draw(batch_size, steps)]
     observations, actions, next_observations, rewards, dones, timeouts = rows.split([3, 2, 3, 1, 1, 1], dim=1)
     return ReplayBufferSamples(observations, actions, next_observations, dones * (1 - timeouts), rewards)
 

@@ -1,12 +1,13 @@
 """
-The update of ``tdc.py`` on static buffers, for plain ReLU networks: no autograd, no allocation, flat parameters.
+The update of ``tdc.py`` on preallocated buffers, for plain ReLU networks: no autograd, no allocation.
 
-The weights of the policy become views of one flat tensor per optimizer, as do their gradients and Adam's moments, so
-that an optimizer step and a Polyak step are one call each. What is computed is ``TDC.update_critics`` and
-``TDC.update_actor`` to float32 rounding, on the same random numbers; the backward passes are derived by hand.
+What is computed is ``TDC.update_critics``, ``TDC.update_actor`` and ``TDC.update_targets`` to float32 rounding, on the
+same random numbers; the backward passes are derived by hand. Parameters, targets and the state of the optimizers stay
+where they are, and the policy is everyone's as before. As soon as anything is not as it was when the update was bound
+(``snapshot.py``), it is examined again (``applicability.py``), and the readable update takes over where it must.
 """
 
-from sb3_tdc.tdc.fused.applicability import check_options, obstacles
+from sb3_tdc.tdc.fused.applicability import obstacles
 from sb3_tdc.tdc.fused.update import FusedUpdate
 
-__all__ = ["FusedUpdate", "check_options", "obstacles"]
+__all__ = ["FusedUpdate", "obstacles"]

@@ -1,49 +1,75 @@
-"""Where the fused update applies."""
+"""Where the fused update applies: nothing that it computes by itself is other than SB3's, PyTorch's and TDC's own."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import FlattenExtractor, get_actor_critic_arch
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.sac.policies import Actor as TanhGaussianActor
 from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import nn
+from torch.nn.modules import module as global_hooks
+from torch.optim import optimizer as global_optimizer_hooks
 
-from sb3_tdc.tdc.policies import QuantileCritic, TDCPolicy
+from sb3_tdc.tdc.policies import QuantileCritic, StackedLinear, TDCPolicy
 
-if TYPE_CHECKING:
-    from sb3_tdc.tdc.tdc import TDC
+th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
 
-# What a subclass of TDC may override, and then expects to be called
-_METHODS = ("train", "update_critics", "update_actor", "update_targets", "_sample_target_actions")
-_OPTIONS = ("bfloat16", "compile_loss")
-_CLASSES = (TDCPolicy, DeterministicActor, TanhGaussianActor, QuantileCritic)
+# Methods whose work the fused update does itself, as they were when this module was imported: (class, name) → function
+REPLACED_METHODS: dict[tuple[type, str], Any] = {
+    (cls, name): getattr(cls, name)
+    for cls, names in {
+        TDCPolicy: ("forward", "predict", "_predict", "scale_action", "unscale_action", "obs_to_tensor"),
+        DeterministicActor: ("forward", "_predict", "extract_features"),
+        TanhGaussianActor: ("forward", "_predict", "extract_features", "get_action_dist_params", "action_log_prob"),
+        QuantileCritic: ("forward", "q1_forward", "extract_features"),
+        StackedLinear: ("forward", "forward_first"),
+        FlattenExtractor: ("forward",),
+        **dict.fromkeys((nn.Sequential, nn.Linear, nn.ReLU, nn.Tanh, nn.Flatten), ("forward",)),
+        nn.Module: ("__call__", "_call_impl"),
+        th.optim.Adam: ("step",),
+    }.items()
+    for name in names
+}
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+_OPTIMIZER_HOOKS = ("_optimizer_step_pre_hooks", "_optimizer_step_post_hooks")
+_GLOBAL_HOOKS: list[dict[int, Any]] = [
+    *(getattr(global_hooks, f"_global{name}") for name in _HOOKS),
+    global_optimizer_hooks._global_optimizer_pre_hooks,
+    global_optimizer_hooks._global_optimizer_post_hooks,
+]
 
 
-def obstacles(model: "TDC") -> list[str]:
-    """:return: what stands in the way of the fused update, in words; nothing where it applies"""
-    from sb3_tdc.tdc.tdc import TDC
+def obstacles(model: Any) -> list[str]:
+    """
+    Examine a model.
 
-    policy, found = model.policy, []
-    space = model.observation_space
+    :param model: a :class:`~sb3_tdc.tdc.tdc.TDC`
+    :return: what stands in the way of the fused update, in words; nothing where it applies
+    """
+    policy, space = model.policy, model.observation_space
+    found = [f"{name} is overridden" for name in model.overridden_methods()]
+    found += [f"{cls.__name__}.{name} is replaced" for cls, name in REPLACED_METHODS if _is_replaced(cls, name)]
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
         found.append("the observations are not flat vectors")
-    if policy.features_extractor_class is not FlattenExtractor:
-        found.append(f"the features extractor is {name_of(policy.features_extractor_class)}")
-    if policy.activation_fn is not nn.ReLU:
-        found.append(f"the activation is {name_of(policy.activation_fn)}, not ReLU")
-    if not all(len(arch) > 0 for arch in get_actor_critic_arch(policy.net_arch)):
-        found.append("a network has no hidden layer")
-    found += [f"{name} is overridden" for name in _METHODS if getattr(type(model), name) is not getattr(TDC, name)]
-    networks = (policy, policy.actor, policy.actor_target, policy.critic, policy.critic_target)
-    found += [f"{type(n).__qualname__} is a class of its own" for n in networks if type(n) not in _CLASSES]
-    if any(hooks(policy)):
-        found.append("a network has hooks")
-    if not all(is_plain_adam(network.optimizer) for network in (policy.actor, policy.critic)):
-        kind = f"{name_of(policy.optimizer_class)} with {policy.optimizer_kwargs}"
-        found.append(f"an optimizer is not a plain Adam (the policy's: {kind})")
-    if not all(p.requires_grad for network in (policy.actor, policy.critic) for p in network.parameters()):
-        found.append("a parameter is frozen")
+    networks = {"actor": policy.actor, "critic": policy.critic}
+    targets = {"actor_target": policy.actor_target, "critic_target": policy.critic_target}
+    for name, network in (networks | targets).items():
+        if getattr(model, name) is not network:
+            found.append(f"model.{name} is not model.policy.{name}")
+    if type(policy) is not TDCPolicy:
+        found.append(f"{type(policy).__qualname__} is a custom class")
+    found += [text for name, network in networks.items() for text in _network_obstacles(name, network)]
+    if not found:
+        found += [text for name, network in targets.items() for text in _network_obstacles(name, network)]
+    if not found:  # the structure is known
+        found += [text for name in networks for text in _parameter_obstacles(name, policy)]
+    for name, network in networks.items():
+        if not is_plain_adam(network.optimizer):
+            found.append(f"the {name}'s optimizer is not a plain Adam: {_describe(network.optimizer)}")
+    if any(_hooks(policy)) or any(_GLOBAL_HOOKS):
+        found.append("a network, a parameter or an optimizer has hooks")
     if model.device.type == "cuda" and not model.fused:
         found.append("on CUDA it must be demanded (fused=True): it has not been measured there")
     elif model.device.type not in ("cpu", "cuda"):
@@ -51,32 +77,95 @@ def obstacles(model: "TDC") -> list[str]:
     return found
 
 
-def name_of(make: Any) -> str:
-    """:return: how to call a class, or a function or object that stands for one"""
-    return getattr(make, "__name__", repr(make))
+def _is_replaced(cls: type, name: str) -> bool:
+    return getattr(cls, name) is not REPLACED_METHODS[cls, name]
+
+
+def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
+    """What is not a ReLU network of the known kind."""
+    if type(network) not in (DeterministicActor, TanhGaussianActor, QuantileCritic):
+        yield f"the {name} is a custom class, {type(network).__qualname__}"
+        return
+    for module in network.modules():
+        shadowed = [key for key in vars(module) if callable(getattr(type(module), key, None))]
+        if shadowed:
+            yield f"{shadowed[0]} of a module of the {name} is replaced"
+    if type(network.features_extractor) is not FlattenExtractor:
+        yield f"the {name}'s features extractor is {type(network.features_extractor).__name__}"
+    if _stacks(network) is None:
+        layers = [type(m).__name__ for m in network.modules() if not list(m.children())]
+        yield f"the {name}'s layers are not linear ones with ReLU between them: {', '.join(layers)}"
+
+
+def _stacks(network: Any) -> list[Any] | None:
+    """The linear layers of a network in the order of its forward pass, or None if there is anything else."""
+    if type(network) is QuantileCritic:
+        return _linear_layers(list(network.layers), StackedLinear, [])
+    if type(network) is DeterministicActor:
+        return _linear_layers(list(network.mu), nn.Linear, [nn.Tanh]) if type(network.mu) is nn.Sequential else None
+    if type(network.latent_pi) is not nn.Sequential or network.use_sde or type(network.mu) is not nn.Linear:
+        return None
+    return _linear_layers([*network.latent_pi, network.mu, network.log_std], nn.Linear, [], n_outputs=2)
+
+
+def _linear_layers(
+    layers: list[Any], linear: type[nn.Module], ending: list[type[nn.Module]], n_outputs: int = 1
+) -> list[Any] | None:
+    kinds = [type(layer) for layer in layers]
+    n_hidden = (len(kinds) - n_outputs - len(ending)) // 2
+    if n_hidden < 1 or kinds != [linear, nn.ReLU] * n_hidden + [linear] * n_outputs + ending:
+        return None
+    return [layer for layer in layers if type(layer) is linear]
+
+
+def _parameter_obstacles(name: str, policy: TDCPolicy) -> Iterator[str]:
+    """What is unusual about the parameters of a network, its target and its optimizer."""
+    network, target = getattr(policy, name), getattr(policy, f"{name}_target")
+    stacks = [_stacks(network), _stacks(target)]
+    parameters, targets = ([p for layer in stack or [] for p in (layer.weight, layer.bias)] for stack in stacks)
+    if any(p is None for p in (*parameters, *targets)):
+        yield f"a layer of the {name} has no bias"
+    elif not _same(list(network.parameters()), parameters) or not _same(list(target.parameters()), targets):
+        yield f"the {name} has parameters of its own, or some twice"
+    elif [p.shape for p in parameters] != [p.shape for p in targets]:
+        yield f"the {name} and its target differ in shape"
+    elif not _same([p for group in network.optimizer.param_groups for p in group["params"]], parameters):
+        yield f"the {name}'s optimizer does not have the parameters of the {name}, in their order"
+    elif not all(p.requires_grad for p in parameters):
+        yield f"a parameter of the {name} is frozen"
+    elif not all(_is_plain(p) for p in (*parameters, *targets)):
+        yield f"a parameter of the {name} is not a contiguous float32 tensor without hooks"
+    elif len({p.data_ptr() for p in (*parameters, *targets)}) < len(parameters) + len(targets):
+        yield f"parameters of the {name} share memory"
+
+
+def _same(a: list[Any], b: list[Any]) -> bool:
+    return len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True))
+
+
+def _is_plain(parameter: Any) -> bool:
+    hooks = parameter._backward_hooks or getattr(parameter, "_post_accumulate_grad_hooks", None)
+    plain = type(parameter) is nn.Parameter and parameter.dtype == th.float32 and parameter.is_contiguous()
+    return plain and not hooks
 
 
 def is_plain_adam(optimizer: Any) -> bool:
-    """:return: whether a step of this optimizer is one of Adam, without extras"""
-    if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1:
+    """Return whether a step of this optimizer is one of Adam, without extras."""
+    if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1 or "step" in vars(optimizer):
         return False
     group = optimizer.param_groups[0]
-    return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or isinstance(group["lr"], th.Tensor))
+    extras = ("weight_decay", "amsgrad", "maximize", "differentiable")
+    numbers = (group["lr"], *group["betas"])
+    return not any(group.get(name) for name in extras) and not any(isinstance(n, th.Tensor) for n in numbers)
 
 
-def hooks(network: nn.Module) -> list[dict[int, Any]]:
-    """:return: where modules keep who wants to be told of their passes"""
-    return [
-        kept
-        for m in network.modules()
-        for kept in (m._forward_hooks, m._forward_pre_hooks, m._backward_hooks, m._backward_pre_hooks)
-    ]
+def _describe(optimizer: Any) -> str:
+    options = {key: value for key, value in optimizer.param_groups[0].items() if key != "params" and value}
+    return f"{type(optimizer).__name__} with {options}"
 
 
-def check_options(fused_kwargs: dict[str, Any]) -> None:
-    """:raises ValueError: for an option of the fused update that is not one"""
-    for name, value in fused_kwargs.items():
-        if name not in _OPTIONS:
-            raise ValueError(f"fused_kwargs may have {', '.join(_OPTIONS)}, got {name!r}")
-        if not isinstance(value, bool):
-            raise ValueError(f"fused_kwargs[{name!r}] must be True or False, got {value!r}")
+def _hooks(policy: TDCPolicy) -> Iterator[Any]:
+    for module in policy.modules():
+        yield from (getattr(module, name) for name in _HOOKS)
+    for optimizer in (policy.actor.optimizer, policy.critic.optimizer):
+        yield from (getattr(optimizer, name, None) for name in _OPTIMIZER_HOOKS)

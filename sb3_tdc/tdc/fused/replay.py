@@ -64,20 +64,21 @@ class PackedReplay:
             and not _METHODS & vars(buffer).keys()
         )
 
-    def sample(self, out: th.Tensor, steps: int) -> None:
+    def draw(self, n: int, steps: int) -> np.ndarray:
         """
-        Draw the minibatch that ``buffer.sample`` would, from the same random numbers.
+        Draw the rows of the minibatch that ``buffer.sample`` would draw, from the same random numbers.
 
-        :param out: (B, width of the rows), where it is written
+        :param n: how many
         :param steps: count of steps of the environments, one for all of them
+        :return: (n,), indices of ``rows``
         """
         buffer = self.buffer
         if self.rows is not self.host_rows:
             self._copy_new_rows(steps)
-        indices = np.random.randint(0, buffer.size(), size=len(out))
+        indices = np.random.randint(0, buffer.size(), size=n)
         if buffer.n_envs > 1:  # of one, SB3 draws nothing
-            indices = indices * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=(len(out),))
-        th.index_select(self.rows, 0, th.from_numpy(indices).to(self.rows.device, non_blocking=True), out=out)
+            indices = indices * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=(n,))
+        return indices
 
     def _copy_new_rows(self, steps: int) -> None:
         """To the device."""

@@ -8,14 +8,16 @@ import torch as th
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_tdc.tdc.fused.applicability import hooks
-from sb3_tdc.tdc.fused.flat_adam import FlatAdam
+from sb3_tdc.tdc.compiled import load_kernels
+from sb3_tdc.tdc.fused import passes
+from sb3_tdc.tdc.fused.adam import AdamStep
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
-from sb3_tdc.tdc.fused.networks import DeterministicHead, Layer, Mlp, TanhGaussianHead, make_layers, relu_backward
+from sb3_tdc.tdc.fused.networks import DeterministicHead, Layer, Mlp, TanhGaussianHead, make_layers
+from sb3_tdc.tdc.fused.passes import Passes
 from sb3_tdc.tdc.fused.replay import PackedReplay, row_widths
 from sb3_tdc.tdc.fused.scalar import Scalar
-from sb3_tdc.tdc.fused.target import LcbTarget
-from sb3_tdc.tdc.quantiles import QuantileHuberGradient
+from sb3_tdc.tdc.fused.snapshot import ModuleSnapshot, Snapshot
+from sb3_tdc.tdc.quantiles import Target
 
 if TYPE_CHECKING:
     from sb3_tdc.tdc.tdc import TDC
@@ -38,13 +40,16 @@ class FusedUpdate:
 
     def __init__(self, model: "TDC", batch_size: int, packed_replay: PackedReplay | None = None):
         self.model, self.batch_size = model, batch_size
-        self.hooks = hooks(model.policy)
-        self.critic_adam = FlatAdam(model.critic, model.critic_target)
-        self.actor_adam = FlatAdam(model.actor, model.actor_target)
+        self.critic_adam = AdamStep(model.critic, model.critic_target)
+        self.actor_adam = AdamStep(model.actor, model.actor_target)
+        self.snapshot, self.actor_snapshot = Snapshot(model), ModuleSnapshot(model.actor.modules())
         self.constants = self._read_constants()
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
         self.packed_replay = packed_replay
+        self.bind = Passes(load_kernels() if model.device.type == "cpu" else None)
         self._make_buffers(model.policy.actor.features_dim, get_action_dim(model.critic.action_space))
+        if packed_replay is not None:
+            self.gather = self._bind_gather(packed_replay)
         self._make_critics()
         self._make_actors()
 
@@ -61,71 +66,77 @@ class FusedUpdate:
         next_observations, self.next_actions = self.next_inputs.split([obs_dim, action_dim], 1)
         self.minibatch = ReplayBufferSamples(observations, actions, next_observations, dones, rewards)
         self.noise = empty(batch_size, action_dim)
-        self.discounts, self.lam = Scalar(empty(batch_size, 1)), Scalar(empty())
+        self.discounts, self.lam = Scalar(empty(batch_size, 1)), Scalar(empty(1))
         self.ent_coef = empty(1)
 
     def _make_critics(self) -> None:
-        model, batch = self.model, self.minibatch
+        batch, bind = self.minibatch, self.bind
         online, target, gradient = self._networks(self.critic_adam)
         self.critic_target = Mlp(target, self.next_inputs)
-        self.target = LcbTarget(
-            self.critic_target.outputs[-1], batch.rewards, batch.dones, self.discounts.tensor, self.lam.tensor
-        )
+        # What was predicted for s' is not needed any more when the slopes are written
         self.critic = Mlp(online, self.inputs, gradient, slopes=self.critic_target.outputs)
-        compiled = model.fused_kwargs.get("compile_loss", False)
-        self.loss_gradient = QuantileHuberGradient(self.critic.outputs[-1], self.target.quantiles, compiled)
+
+        next_quantiles, current = self.critic_target.outputs[-1], self.critic.outputs[-1]
+        n_critics, batch_size, n_quantiles = next_quantiles.shape
+        mean, std = current.new_empty(n_critics, batch_size), current.new_empty(n_critics, batch_size)
+        selected = th.empty(batch_size, dtype=th.int64, device=current.device)
+        self.target = Target(current.new_empty(batch_size, n_quantiles), mean.mT, std.mT, selected)
+        transitions = (batch.rewards, batch.dones, self.discounts.tensor, self.lam.tensor)
+        results = (mean, std, selected, self.target.quantiles)
+        self.set_target = bind(passes.lcb_target, next_quantiles, *transitions, *results)
+        self.set_loss_slope = bind(
+            passes.quantile_huber_gradient, current, self.target.quantiles, self.critic.slopes[-1], gradient[-1].bias
+        )
 
         # Q₁: the hidden layers of the first critic, then the mean of its quantiles folded into the last layer
-        *hidden, self.quantile_layer = (layer.first() for layer in online)
+        *hidden, last = (layer.first() for layer in online)
         outputs, slopes = (
             [buffer[0] for buffer in buffers[: len(hidden)]] for buffers in (self.critic.outputs, self.critic.slopes)
         )
         self.value = Mlp(hidden, self.inputs, activate_output=True, outputs=outputs, slopes=slopes)
+        self.values = current.new_empty(batch_size)
+        self.set_values = bind(passes.mean_value, outputs[-1], last.weight, last.bias, slopes[-1], self.values)
         self.action_weight = online[0].weight[0, batch.observations.shape[1] :].mT  # (out, A)
 
     def _make_actors(self) -> None:
-        model, batch = self.model, self.minibatch
-        online, target, gradient = self._networks(self.actor_adam, n_outputs=1 + model.stochastic_actor)
-        self.mean_layers = online[:-1] if model.stochastic_actor else online
-        make_head: Any = TanhGaussianHead if model.stochastic_actor else DeterministicHead
-        self.head = make_head(online, batch.observations, batch.actions, gradient)
-        self.target_head = make_head(target, batch.next_observations, self.next_actions)
+        batch, bind = self.minibatch, self.bind
+        online, target, gradient = self._networks(self.actor_adam)
+        self.mean_layers = online[:-1] if self.model.stochastic_actor else online
+        if self.model.stochastic_actor:
+            self.head: Any = TanhGaussianHead(online, batch.observations, batch.actions, bind, gradient, self.ent_coef)
+            self.target_head: Any = TanhGaussianHead(target, batch.next_observations, self.next_actions, bind)
+        else:
+            self.head = DeterministicHead(online, batch.observations, batch.actions, bind, gradient)
+            self.target_head = DeterministicHead(target, batch.next_observations, self.next_actions, bind)
+            self.smooth = bind(passes.smooth_actions, self.noise, self.next_actions)
 
-    def _networks(self, adam: FlatAdam, n_outputs: int = 1) -> list[list[Layer]]:
-        """Online, target, gradient."""
-        bfloat16 = self.model.fused_kwargs.get("bfloat16", False)
-        return [make_layers(adam.views(flat), n_outputs, bfloat16) for flat in (adam.value, adam.target, adam.gradient)]
+    @staticmethod
+    def _networks(adam: AdamStep) -> list[list[Layer]]:
+        """Return the layers of the online network, of the target, and of the gradient."""
+        return [make_layers(tensors) for tensors in (adam.values, adam.targets, adam.gradients)]
 
     def _read_constants(self) -> tuple[Any, ...]:
         """What is read from Python in a part of an update, and so stays as it was in a CUDA graph."""
         model = self.model
-        groups = [adam.optimizer.param_groups[0] for adam in (self.critic_adam, self.actor_adam)]
-        options = tuple(sorted(model.fused_kwargs.items()))
-        return (
-            *(model.kappa, model.tau, model.target_policy_noise, model.target_noise_clip, options),
-            *((group["betas"], group["eps"]) for group in groups),
-        )
+        return model.kappa, model.tau, model.target_policy_noise, model.target_noise_clip
 
     def fits(self, batch_size: int) -> bool:
-        """:return: whether the buffers are of this size, and all that :func:`obstacles` looks at is as it was"""
-        return (
-            batch_size == self.batch_size
-            and self.critic_adam.owns_parameters()
-            and self.actor_adam.owns_parameters()
-            and self.constants == self._read_constants()
-            and not any(self.hooks)
-        )
+        """Return whether the buffers are of this size, and all that an update relies on is as it was."""
+        return batch_size == self.batch_size and self.constants == self._read_constants() and self.snapshot.is_current()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> None:
+        """Return None: a copy of the model binds an update to its own networks."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()  # and so does one that was pickled
 
     def sample(self, batch_size: int) -> ReplayBufferSamples:
         """:return: a minibatch of the model's replay buffer; of a packed one, overwritten by the next"""
         model, packed = self.model, self._find_packed_replay()
         if packed is None:
             return model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
-        packed.sample(self.rows, model.num_timesteps // model.n_envs)
-        batch = self.minibatch
-        batch.next_observations.copy_(self.drawn_next_observations)
-        batch.dones.addcmul_(batch.dones, self.timeouts, value=-1)  # terminated
-        return batch
+        self.gather(packed.draw(batch_size, model.num_timesteps // model.n_envs))
+        return self.minibatch
 
     def _find_packed_replay(self) -> PackedReplay | None:
         """The model's replay buffer as rows, where that is possible."""
@@ -136,7 +147,18 @@ class FusedUpdate:
             if not PackedReplay.applies(buffer):
                 return None
             self.packed_replay = PackedReplay(buffer)
+            self.gather = self._bind_gather(self.packed_replay)
         return self.packed_replay
+
+    def _bind_gather(self, packed: PackedReplay) -> Callable[..., Any]:
+        batch = self.minibatch
+        next_observations = self.drawn_next_observations, batch.next_observations
+        return self.bind(passes.gather, packed.rows, self.rows, *next_observations, batch.dones, self.timeouts)
+
+    def acts(self) -> bool:
+        """Return whether :meth:`act` is what the policy does."""
+        model = self.model
+        return model.policy.actor is self.snapshot.networks[0] and self.actor_snapshot.is_current()
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
@@ -162,28 +184,30 @@ class FusedUpdate:
         else:
             self.discounts.copy_(discounts)
         self.run(self._update_critics)
+        self.critic_adam.show_gradients()
         if model.diagnoses_critics:
-            model.diagnose_critics(self.critic.outputs[-1].transpose(0, 1), self.target.details())
+            model.diagnose_critics(self.critic.outputs[-1].transpose(0, 1), self.target)
 
     def _update_critics(self) -> None:
         self._set_target_actions()
         self.critic_target.forward()  # Eq. 3
-        self.target.compute()  # Eq. 4–7
+        self.set_target()  # Eq. 4–7
         self.critic.forward()
-        self.critic.backward(self.loss_gradient(self.model.kappa))  # Eq. 8–10
+        self.set_loss_slope(self.model.kappa)  # Eq. 8–10
+        self.critic.backward()
         self.critic_adam.step()
 
     def _set_target_actions(self) -> None:
-        actions, model = self.target_head.act(), self.model  # Eq. 2
-        if not model.stochastic_actor:
-            noise = self.noise.normal_(0, model.target_policy_noise)
-            noise.clamp_(-model.target_noise_clip, model.target_noise_clip)
-            actions.add_(noise).clamp_(-1, 1)  # Eq. 1
+        self.target_head.act()  # Eq. 2
+        if not self.model.stochastic_actor:
+            self.noise.normal_(0, self.model.target_policy_noise)
+            self.smooth(self.model.target_noise_clip)  # Eq. 1
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
         """``TDC.update_actor``, on the observations of the critics' update"""
         model = self.model
         self.actor_adam.read_learning_rate()
+        self.actor_adam.show_gradients()
         if not model.stochastic_actor:
             model.diagnose(actor_loss=self.run(self._update_deterministic_actor).clone())
             return
@@ -194,25 +218,24 @@ class FusedUpdate:
 
     def _update_deterministic_actor(self) -> th.Tensor:
         self.head.act()
-        values, slope = self._value_and_slope()
-        self.head.backward(slope)
+        self._set_value_slope()
+        self.head.backward()
         self.actor_adam.step()
-        return -values.mean()  # Eq. 12
+        return -self.values.mean()  # Eq. 12
 
     def _update_stochastic_actor(self) -> tuple[th.Tensor, th.Tensor]:
         self.head.act()
         log_prob = self.head.log_prob()
-        values, slope = self._value_and_slope()
-        self.head.backward(slope, self.ent_coef)
+        self._set_value_slope()
+        self.head.backward()
         self.actor_adam.step()
-        return (self.ent_coef * log_prob - values).mean(), log_prob  # Eq. 13
+        return (self.ent_coef * log_prob - self.values).mean(), log_prob  # Eq. 13
 
-    def _value_and_slope(self) -> tuple[th.Tensor, th.Tensor]:
-        """Q₁ (Eq. 11) of the actions in the inputs, (B,), and the slope of −mean Q₁ at these actions, (B, A)."""
-        hidden = self.value.forward()
-        weight, bias = self.quantile_layer.weight.mean(dim=1), self.quantile_layer.bias.mean()
-        slope = relu_backward((weight / -self.batch_size).expand_as(hidden), hidden, out=self.value.slopes[-1])
-        return hidden @ weight + bias, self.value.backward(slope) @ self.action_weight
+    def _set_value_slope(self) -> None:
+        """Compute Q₁ (Eq. 11) of the actions in the inputs, and the slope of −mean Q₁ at these actions."""
+        self.value.forward()
+        self.set_values()
+        th.mm(self.value.backward(), self.action_weight, out=self.head.action_slope)
 
     def update_targets(self) -> None:
         """``TDC.update_targets``"""
