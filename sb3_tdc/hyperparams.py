@@ -81,11 +81,11 @@ def hyperparams_file(algo: str) -> Path:
     return (installed if installed.is_dir() else checkout) / f"{algo}.yml"
 
 
-def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], bool]:
+def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], str]:
     """
-    The entry of an environment, with the file's ``default`` merged under it.
+    The entry of an environment, or else of its nearest version, with the file's ``default`` merged under it.
 
-    :return: the entry and whether the environment has one of its own
+    :return: the entry and its name in the file: ``default`` if there is none of any version
     :raises ValueError: if the file cannot be read, or has neither an entry nor a default
     """
     try:
@@ -96,9 +96,28 @@ def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], bool]:
         raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(entries, dict) or not all(isinstance(e, dict) for e in entries.values()):
         raise ValueError(f"{path} must map environment ids to hyperparameters")
-    if env_id not in entries and "default" not in entries:
+    name = _nearest_version(env_id, entries)
+    if name not in entries:
         raise ValueError(f"{path} has no entry for {env_id} and no default{suggest(env_id, entries)}")
-    return {**entries.get("default", {}), **entries.get(env_id, {})}, env_id in entries
+    return {**entries.get("default", {}), **entries[name]}, name
+
+
+def _nearest_version(env_id: str, names: Iterable[Any]) -> str:
+    """:return: of ``Name-v4`` and its like the one next to an id; of two that are as near, the newer; or ``default``"""
+    names = [str(name) for name in names]
+    if env_id in names:
+        return env_id
+    base, version = _split_version(env_id)
+    versions = {_split_version(name)[1]: name for name in names if _split_version(name)[0] == base}
+    # An id without a version stands for the newest one
+    key = (lambda other: other) if version < 0 else (lambda other: (-abs(other - version), other))
+    return versions[max(versions, key=key)] if versions else "default"
+
+
+def _split_version(env_id: str) -> tuple[str, int]:
+    """``Walker2d-v4`` → ``("Walker2d", 4)``; without a version, −1."""
+    base, _, version = env_id.rpartition("-v")
+    return (base, int(version)) if base and version.isdecimal() else (env_id, -1)
 
 
 def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> Hyperparams:

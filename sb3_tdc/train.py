@@ -58,15 +58,16 @@ def make_parser() -> Parser:
 def read_hyperparams(args: argparse.Namespace) -> Hyperparams:
     """The entry of the environment, overruled by ``-params`` and ``-n``, validated; said on screen."""
     path = args.conf_file or hyperparams_file(args.algo)
-    entry, has_entry = read_entry(path, args.env)
+    entry, name = read_entry(path, args.env)
     overrides = {**args.hyperparams, **({"n_timesteps": args.n_timesteps} if args.n_timesteps > 0 else {})}
     algorithm = ALGORITHMS[args.algo]
-    where = f"{path}, {args.env if has_entry else 'default'}"
+    where = f"{path}, {name}"
     parse({"n_timesteps": 1, **entry}, algorithm, where)  # so that an error names its source
     parse({"n_timesteps": 1, **overrides}, algorithm, "command line (-params)")
     hyperparams = parse({**entry, **overrides}, algorithm, where)
     if args.verbose > 0:
-        print(f"Hyperparameters: {where}{'' if has_entry else f' (it has no entry for {args.env})'}")
+        nearest = "" if name == "default" else "; this is the nearest version"
+        print(f"Hyperparameters: {where}{'' if name == args.env else f' (it has no entry for {args.env}{nearest})'}")
         print(textwrap.indent(yaml.safe_dump(hyperparams.raw, sort_keys=False), "  "), end="")
     return hyperparams
 

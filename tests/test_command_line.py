@@ -109,6 +109,13 @@ def test_an_environment_without_an_entry_gets_the_default(tmp_path, capsys):
     assert not list((tmp_path / "tdc" / "Pendulum-v1_1").glob("events*"))  # -tb "": off
 
 
+def test_an_environment_in_another_version_gets_the_entry_of_the_nearest(tmp_path, capsys):
+    assert run_train(tmp_path, "-tb", "", env="Hopper-v5") == 0
+    assert "tdc.yml, Hopper-v4 (it has no entry for Hopper-v5; this is the nearest version)" in capsys.readouterr().out
+    saved = TDC.load(tmp_path / "tdc" / "Hopper-v5_1" / "Hopper-v5.zip")
+    assert (saved.lam, saved.qf_learning_rate) == (0.9, 2e-4)  # Table 1
+
+
 def test_stochastic_head_several_environments_and_normalisation(tmp_path, capsys):
     options = [*SMALL, "stochastic_actor:true", "n_envs:2", "normalize:true", "frame_stack:2"]
     assert run_train(tmp_path, "--vec-env", "subproc", "--n-eval-envs", 2, small=options) == 0

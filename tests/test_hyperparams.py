@@ -28,8 +28,8 @@ def parse_tdc(entry, algorithm=TDC):
 
 @pytest.mark.parametrize("env_id", TABLE_1)
 def test_table_1(env_id):
-    entry, has_entry = read_entry(hyperparams_file("tdc"), env_id)
-    assert has_entry
+    entry, name = read_entry(hyperparams_file("tdc"), env_id)
+    assert name == env_id
     h = parse(entry, TDC, "")
     m = h.model
     rates = (m["learning_rate"], m["qf_learning_rate"])
@@ -54,8 +54,37 @@ def test_every_file_is_valid_in_every_entry(algo):
 def test_the_default_lies_under_every_entry(tmp_path):
     path = tmp_path / "my.yml"
     path.write_text("default: {n_timesteps: 7, lam: 0.5}\nA-v0: {lam: 0.2}\n")
-    assert read_entry(path, "A-v0") == ({"n_timesteps": 7, "lam": 0.2}, True)
-    assert read_entry(path, "B-v0") == ({"n_timesteps": 7, "lam": 0.5}, False)
+    assert read_entry(path, "A-v0") == ({"n_timesteps": 7, "lam": 0.2}, "A-v0")
+    assert read_entry(path, "B-v0") == ({"n_timesteps": 7, "lam": 0.5}, "default")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        ("A-v2", "A-v2"),
+        ("A-v3", "A-v2"),
+        ("A-v4", "A-v6"),  # as near as A-v2, and newer
+        ("A-v99", "A-v6"),
+        ("A-v0", "A-v2"),
+        ("A", "A-v6"),
+        ("B-v1", "B"),
+        ("my/A-v3", "my/A-v1"),
+        ("AA-v2", "default"),
+        ("A-vx", "default"),
+        ("-v2", "default"),
+    ],
+)
+def test_another_version_of_an_environment_gets_the_entry_of_the_nearest(tmp_path, env_id, name):
+    path = tmp_path / "my.yml"
+    names = ("default", "A-v2", "A-v6", "B", "my/A-v1")
+    path.write_text("".join(f"{name}: {{n_timesteps: {i}}}\n" for i, name in enumerate(names)))
+    assert read_entry(path, env_id) == ({"n_timesteps": names.index(name)}, name)
+
+
+def test_without_a_default_the_nearest_version_is_enough(tmp_path):
+    path = tmp_path / "my.yml"
+    path.write_text("A-v2: {n_timesteps: 7}\n")
+    assert read_entry(path, "A-v3") == ({"n_timesteps": 7}, "A-v2")
 
 
 def test_values_become_what_the_constructor_wants():

@@ -25,9 +25,10 @@ def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
     """:return: a check of a field, as :func:`boolean` is one"""
 
     def check(name: str, value: Any) -> int:
-        if check_integer(name, value, minimum) > maximum:
-            raise ValueError(f"{name} must be at most {maximum:,}, got {value:,}")
-        return value
+        number = check_integer(name, value, minimum)
+        if number > maximum:
+            raise ValueError(f"{name} must be at most {maximum:,}, got {number:,}")
+        return number
 
     return check
 

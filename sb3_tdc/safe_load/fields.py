@@ -25,6 +25,8 @@ from sb3_tdc.tdc.checks import check_number
 MAX_REPLAY_BYTES = 2**36  # of the replay buffer that a loaded model gets
 MAX_CRITICS = 256
 MAX_ENVS = 10_000
+# What is made of the argument ent_coef
+TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
@@ -89,6 +91,11 @@ def _arguments(name: str, value: Any) -> dict[str, Any]:
     return value
 
 
+def _none(name: str, value: Any) -> None:
+    if value is not None:
+        raise ValueError(f"{name} must be null, got {value!r:.100}")
+
+
 def _or_none(check: Callable[[str, Any], Any]) -> Callable[[str, Any], Any]:
     return lambda name, value: None if value is None else check(name, value)
 
@@ -112,6 +119,7 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     "fused": _or_none(boolean),
     "verbose": integer(0, 2),
     "n_envs": integer(1, MAX_ENVS),
+    **dict.fromkeys(TEMPERATURE, _none),  # where there is one, it is a tensor, and elsewhere in the file
     **dict.fromkeys(("gradient_steps", "sde_sample_freq"), integer(-1)),
     **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "policy_delay", "target_update_interval"), integer(1)),
     **dict.fromkeys(
@@ -136,7 +144,7 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
 # What is made anew when a model is set up or learns; the file's is not looked at
 _MADE_ANEW = {
     "lr_schedule", "start_time", "ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs",
-    "_last_episode_starts", "_last_dones", "_target_entropy", "tensorboard_log", "device", "env", "eval_env",
+    "_last_episode_starts", "_last_dones", "tensorboard_log", "device", "env", "eval_env",
     "create_eval_env", "_logger", "_custom_logger", "_vec_normalize_env", "replay_buffer", "sde_support",
     *(f"{of}batch_norm_stats{target}" for of in ("", "actor_", "critic_") for target in ("", "_target")),
 }  # fmt: skip

@@ -12,7 +12,14 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.checks import reading
-from sb3_tdc.safe_load.fields import check_replay_memory, known_policies, nearest_algorithm, parse_data, read_fields
+from sb3_tdc.safe_load.fields import (
+    TEMPERATURE,
+    check_replay_memory,
+    known_policies,
+    nearest_algorithm,
+    parse_data,
+    read_fields,
+)
 from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
 from sb3_tdc.safe_load.weights import check_optimizer, check_weights, read_tensors
 
@@ -50,10 +57,12 @@ def load_safely(
         for required in ("data", "policy.pth"):
             if required not in entries:
                 raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
-        fields = read_fields(entries["data"], {**kwargs, **(custom_objects or {})})
+        given = {**kwargs, **(custom_objects or {})}
+        fields = read_fields(entries["data"], {name: value for name, value in given.items() if name != "ent_coef"})
         policy_class = fields.pop("policy_class", None)
         saved_by = known_policies().get(policy_class) or nearest_algorithm(policy_class)
-        fields.update(kwargs)
+        new_temperature = "ent_coef" in given and given["ent_coef"] != fields.get("ent_coef")
+        fields.update({name: given[name] for name in (*kwargs, "ent_coef") if name in given})
         if saved_by is None:
             raise UnsafeFileError("it has no policy_class of TDC, TD3, SAC, DDPG or TQC")
         if algorithm is not None and not issubclass(algorithm, saved_by):
@@ -76,7 +85,7 @@ def load_safely(
                 raise UnsafeFileError(f"it has no {name}: give env")
         check_replay_memory(fields)
         check_weights(policy_class, fields, tensors["policy"])
-        return _make_model(algorithm, policy_class, env, device, fields, tensors)
+        return _make_model(algorithm, policy_class, env, device, fields, tensors, new_temperature)
 
 
 def read_data(path: str | Path) -> dict[str, Any]:
@@ -96,12 +105,17 @@ def _make_model(
     device: th.device | str,
     fields: dict[str, Any],
     tensors: dict[str, Any],
+    new_temperature: bool,
 ) -> OffPolicyAlgorithm:
     model: Any = algorithm(policy_class, env, device=device, _init_setup_model=False)  # type: ignore[arg-type,call-arg]
     vars(model).update(fields)
     model._setup_model()
     state_dicts, variables = model._get_torch_save_params()
     saved_variables = {**tensors.pop("tensors", {}), **tensors.pop("pytorch_variables", {})}
+    if new_temperature:
+        saved_variables = {name: value for name, value in saved_variables.items() if name not in TEMPERATURE}
+        tensors = {name: value for name, value in tensors.items() if name not in TEMPERATURE}
+        tensors |= {name: getattr(model, name).state_dict() for name in state_dicts if name in TEMPERATURE}
     for name in state_dicts:
         if name.endswith("optimizer"):
             with reading(f"{name}.pth"):

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_tdc.safe_load.archives import read_archive
 from sb3_tdc.safe_load.checks import is_plain, reading
 from sb3_tdc.safe_load.inert_pickle import PERSISTENT, Call, Name, Rebuild, UnsafeFileError, read_pickle, rebuild
+from sb3_tdc.tdc.checks import find_non_finite
 
 _TENSOR_ENTRIES = re.compile(
     r"[\w.-]+/(data\.pkl|version|byteorder|\.format_version|\.storage_alignment|\.data/serialization_id|data/\d+)"
@@ -91,9 +92,8 @@ def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weight
                 f"policy.pth: {str(name)[:100]} is {found.get(name, 'missing')}, but the environment and policy_kwargs "
                 f"make it {expected.get(name, 'nothing')}"
             )
-    for name, tensor in weights.items():
-        if not tensor.isfinite().all():
-            raise UnsafeFileError(f"policy.pth: {name} has values that are not finite")
+    for name in find_non_finite(policy, weights):
+        raise UnsafeFileError(f"policy.pth: {name} has values that are not finite")
 
 
 _OF_THE_SHAPE_OF_ITS_PARAMETER = {

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from torch import nn
 
 
 def _allowed(kind: str, minimum: float, maximum: float) -> str:
@@ -13,29 +14,54 @@ def _allowed(kind: str, minimum: float, maximum: float) -> str:
     return f"{kind} of at least {minimum}" if minimum > -math.inf else kind
 
 
+def _as_number(value: Any) -> float:
+    """Whatever ``float()`` takes, for instance an array of one number, but no text and no truth value; else NaN."""
+    if isinstance(value, (str, bytes, bool, np.bool_)):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return math.nan
+
+
 def check_number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
     """
     :return: the value, a finite number in [minimum, maximum]
     :raises ValueError: if it is anything else
     """
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or not minimum <= value <= maximum:
+    number = _as_number(value)
+    if not math.isfinite(number) or not minimum <= number <= maximum:
         raise ValueError(f"{name} must be {_allowed('a finite number', minimum, maximum)}, got {value!r}")
-    return float(value)
+    return number
 
 
 def check_integer(name: str, value: Any, minimum: int) -> int:
     """
-    :return: the value, an integer of at least ``minimum``
+    :return: the value, an integer of at least ``minimum``; 1e6 is one, too
     :raises ValueError: if it is anything else
     """
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < minimum:
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    number = value if is_integer else _as_number(value)
+    if not math.isfinite(number) or number != int(number) or number < minimum:
         raise ValueError(f"{name} must be {_allowed('an integer', minimum, math.inf)}, got {value!r}")
-    return int(value)
+    return int(number)
+
+
+def find_non_finite(network: nn.Module, weights: dict[str, Any]) -> list[str]:
+    """
+    Look at parameters and running statistics; a constant, for instance the mask of an attention, may be infinite.
+
+    :param network: whose weights they are; its own are not looked at
+    :param weights: a state dict
+    :return: the names of those that are NaN or infinite
+    """
+    parameters = {name for name, _ in network.named_parameters(remove_duplicate=False)}
+    checked = (name for name in weights if name in parameters or "running_" in name)
+    return [name for name in checked if not weights[name].isfinite().all()]
 
 
 def check_action_space(action_space: spaces.Space) -> None:
-    """:raises ValueError: unless the actions are a bounded ``Box``"""
+    """:raises ValueError: unless the actions are a bounded ``Box`` of floating-point numbers"""
     if not isinstance(action_space, spaces.Box):
         raise ValueError(f"env must have a Box action space (continuous actions), got {action_space}")
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
@@ -45,3 +71,12 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
     if not (action_space.low < action_space.high).all():
         raise ValueError(f"env must have an action space with low < high, got {action_space}")
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(f"env must have an action space of floating-point numbers, got {action_space}")
+    with np.errstate(over="ignore"):
+        widths = action_space.high - action_space.low
+    if not np.isfinite(widths).all():
+        raise ValueError(
+            f"env must have an action space whose width, high − low, is finite in {action_space.dtype}, got "
+            f"{action_space}: wrap it in gymnasium.wrappers.RescaleAction or give the Box narrower bounds"
+        )

@@ -3,6 +3,7 @@
 import math
 
 import torch as th
+from stable_baselines3.common.logger import Logger
 
 # Pending scalars are fetched at the latest after so many, so that a run that never logs still notices a NaN
 _MAX_PENDING = 1000
@@ -13,13 +14,19 @@ class NonFiniteError(FloatingPointError):
 
 
 class Diagnostics:
-    """Running means of scalar tensors by name. ``add`` never waits for the device; ``fetch`` does, once."""
+    """
+    Running means of scalar tensors by name. ``add`` never waits for the device; ``fetch`` does, once.
+
+    ``is_recorded`` says whether the logger has the means; whoever adds values sets it to False.
+    """
 
     def __init__(self) -> None:
         self._pending: list[tuple[str, int, int, th.Tensor]] = []
         self._sums: dict[str, float] = {}
         self._counts: dict[str, int] = {}
         self._last_finite: dict[str, int] = {}
+        self._ended: list[str] = []  # means that begin anew with the next value
+        self.is_recorded = True
 
     def add(self, update: int, timestep: int, values: dict[str, th.Tensor]) -> None:
         """
@@ -34,14 +41,26 @@ class Diagnostics:
 
     def fetch(self) -> dict[str, float]:
         """
-        :return: the mean of every scalar since the last call
+        :return: the mean of every scalar since the last :meth:`restart`; if it had no value since, the mean before
         :raises NonFiniteError: if one is NaN or infinite, with the update at which it was first seen
         """
         self._collect()
-        means = {name: self._sums[name] / self._counts[name] for name in self._sums}
-        self._sums.clear()
-        self._counts.clear()
-        return means
+        return {name: self._sums[name] / self._counts[name] for name in self._sums}
+
+    def restart(self) -> None:
+        """Begin every mean anew."""
+        self._collect()
+        self._ended = list(self._sums)
+
+    def record(self, logger: Logger) -> None:
+        """
+        Leave the means in a logger, as ``train/...``.
+
+        :raises NonFiniteError: as :meth:`fetch`
+        """
+        for name, mean in self.fetch().items():
+            logger.record(f"train/{name}", mean)
+        self.is_recorded = True
 
     def _collect(self) -> None:
         if not self._pending:
@@ -57,5 +76,8 @@ class Diagnostics:
                     "stopped. Look for extreme rewards or observations, or lower the learning rates."
                 )
             self._last_finite[name] = update
+            if name in self._ended:
+                self._ended.remove(name)
+                self._sums[name], self._counts[name] = 0.0, 0
             self._sums[name] = self._sums.get(name, 0.0) + number
             self._counts[name] = self._counts.get(name, 0) + 1

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import (
@@ -77,8 +78,8 @@ class QuantileCritic(ContinuousCritic):
         n_critics: int = 2,
         share_features_extractor: bool = True,
     ):
-        check_integer("n_quantiles", n_quantiles, minimum=1)
-        check_integer("n_critics", n_critics, minimum=1)
+        n_quantiles = check_integer("n_quantiles", n_quantiles, minimum=1)
+        n_critics = check_integer("n_critics", n_critics, minimum=1)
         super().__init__(
             observation_space,
             action_space,
@@ -129,6 +130,13 @@ class QuantileCritic(ContinuousCritic):
         for layer in self.layers:
             hidden = layer.forward_first(hidden) if isinstance(layer, StackedLinear) else layer(hidden)
         return hidden.mean(dim=1, keepdim=True)
+
+
+class TanhGaussian(SquashedDiagGaussianDistribution):
+    """SB3's distribution; a copy does not have the last sample, which may hold a graph of autograd."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "distribution": None, "gaussian_actions": None}
 
 
 class TDCPolicy(TD3Policy):
@@ -196,9 +204,12 @@ class TDCPolicy(TD3Policy):
     def make_actor(  # type: ignore[override]
         self, features_extractor: BaseFeaturesExtractor | None = None
     ) -> DeterministicActor | TanhGaussianActor:
-        actor_class = TanhGaussianActor if self.stochastic_actor else DeterministicActor
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
-        return actor_class(**actor_kwargs).to(self.device)
+        if not self.stochastic_actor:
+            return DeterministicActor(**actor_kwargs).to(self.device)
+        actor = TanhGaussianActor(**actor_kwargs)
+        actor.action_dist = TanhGaussian(get_action_dim(self.action_space))  # type: ignore[assignment]
+        return actor.to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> QuantileCritic:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)

@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -17,7 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
 
-from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
+from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number, find_non_finite
 from sb3_tdc.tdc.compiled import numba_version
 from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
@@ -134,7 +135,7 @@ class TDC(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
     ):
         if env is not None:  # None when a model is loaded without one
-            env = maybe_make_env(env, verbose)
+            env = self._wrap_env(maybe_make_env(env, verbose), verbose)  # it also converts environments of OpenAI Gym
             check_action_space(env.action_space)
         super().__init__(
             policy,
@@ -147,7 +148,7 @@ class TDC(OffPolicyAlgorithm):
             gamma,
             train_freq,
             gradient_steps,
-            action_noise=action_noise,  # type: ignore[arg-type]  # a number becomes noise in _setup_model
+            action_noise=action_noise,  # type: ignore[arg-type]  # a number becomes noise in the setter
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
@@ -171,6 +172,10 @@ class TDC(OffPolicyAlgorithm):
         self.target_noise_clip = target_noise_clip
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
+        # As in SAC: None where the temperature is not learned, or not fixed
+        self.log_ent_coef: Any = None
+        self.ent_coef_optimizer: Any = None
+        self.ent_coef_tensor: Any = None
         self.fused = fused
 
         if _init_setup_model:
@@ -180,22 +185,21 @@ class TDC(OffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         for name, maximum in (("tau", 1.0), ("gamma", 1.0)):
-            check_number(name, getattr(self, name), 0.0, maximum)
+            setattr(self, name, check_number(name, getattr(self, name), 0.0, maximum))
         for name in ("kappa", "target_policy_noise", "target_noise_clip"):
-            check_number(name, getattr(self, name), 0.0)
-        for name, minimum in (("buffer_size", 1), ("batch_size", 1), ("n_steps", 1), ("policy_delay", 1)):
-            check_integer(name, getattr(self, name), minimum)
-        check_integer("learning_starts", self.learning_starts, 0)
-        check_integer("gradient_steps", self.gradient_steps, -1)
+            setattr(self, name, check_number(name, getattr(self, name), 0.0))
+        minima = {"learning_starts": 0, "gradient_steps": -1}
+        for name in ("buffer_size", "batch_size", "n_steps", "policy_delay", *minima):
+            setattr(self, name, check_integer(name, getattr(self, name), minima.get(name, 1)))
         for name in ("n_quantiles", "n_critics"):
             check_integer(f"policy_kwargs[{name!r}]", self.policy_kwargs.get(name, 1), 1)
-        if self.action_noise is not None and not isinstance(self.action_noise, ActionNoise):
-            check_number("action_noise (if not an ActionNoise or None)", self.action_noise, 0.0)
         if self.target_entropy != "auto":
             check_number('target_entropy (if not "auto")', self.target_entropy)
         self._initial_ent_coef()
         for name in ("lam", "learning_rate", "qf_learning_rate"):
-            self._scheduled(name, progress_remaining=1.0)
+            value = self._scheduled(name, progress_remaining=1.0)
+            if getattr(self, name) is not None and not callable(getattr(self, name)):
+                setattr(self, name, value)
         saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
@@ -203,11 +207,12 @@ class TDC(OffPolicyAlgorithm):
 
     def _initial_ent_coef(self) -> float:
         coefficient = self.ent_coef
-        if isinstance(coefficient, str) and coefficient.startswith("auto"):
+        learned = isinstance(coefficient, str) and coefficient.startswith("auto")
+        if isinstance(coefficient, str) and learned:
             coefficient = coefficient.removeprefix("auto").removeprefix("_") or "1.0"
         try:
             value = check_number("ent_coef", float(coefficient), 0.0)
-            if value > 0 or not self._learns_ent_coef:
+            if value > 0 or not learned:
                 return value
         except (TypeError, ValueError):
             pass
@@ -218,21 +223,35 @@ class TDC(OffPolicyAlgorithm):
 
     @property
     def _learns_ent_coef(self) -> bool:
-        return isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto")
+        return self.ent_coef_optimizer is not None
 
     def _scheduled(self, name: str, progress_remaining: float | None = None) -> float:
         """The current value of ``lam``, ``learning_rate`` or ``qf_learning_rate``, checked."""
         value = getattr(self, name)
         if value is None and name == "qf_learning_rate":
             return self._scheduled("learning_rate", progress_remaining)
+        if name == "learning_rate" and progress_remaining is None:
+            value = self._current_lr_schedule()
         if not callable(value):
             return check_number(name, value, 0.0)
-        progress = self._current_progress_remaining if progress_remaining is None else progress_remaining
+        # A run overshoots its end by the rest of its last rollout; a schedule is for a progress between 1 and 0
+        progress = max(self._current_progress_remaining, 0.0) if progress_remaining is None else progress_remaining
         return check_number(f"{name} (a schedule, at progress remaining {progress:.4g})", value(progress), 0.0)
+
+    def _current_lr_schedule(self) -> Schedule:
+        """SB3's ``lr_schedule``, made anew from ``learning_rate`` where that has been changed since."""
+        if self.learning_rate is not self._scheduled_learning_rate:
+            self._scheduled("learning_rate", progress_remaining=1.0)  # checks it
+            self._setup_lr_schedule()
+        return self.lr_schedule
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        self._scheduled_learning_rate = self.learning_rate
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        self._setup_action_noise()
+        self.action_noise = self.action_noise  # a saved model's, for the environments of this one
         # The user's policy_kwargs stay theirs: SB3 compares them when a model is loaded
         policy_kwargs = self.policy_kwargs
         self.policy_kwargs = {**policy_kwargs, "stochastic_actor": self.stochastic_actor}
@@ -243,18 +262,26 @@ class TDC(OffPolicyAlgorithm):
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         self._diagnostics = Diagnostics()
         self._setup_fused_update()
-        if self.stochastic_actor:
-            self._setup_temperature()
+        self._setup_temperature()
 
-    def _setup_action_noise(self) -> None:
-        noise: Any = self.action_noise
-        if isinstance(noise, VectorizedActionNoise):
-            noise = noise.base_noise  # learn() wraps it again, for its number of environments
-        elif noise is not None and not isinstance(noise, ActionNoise):
-            shape = self.action_space.shape
-            assert shape is not None
-            noise = NormalActionNoise(np.zeros(shape), np.full(shape, float(noise)))
-        self.action_noise = noise
+    @property
+    def action_noise(self) -> ActionNoise | None:
+        """Exploration noise. A number put here becomes Gaussian noise, and noise of one environment that of all."""
+        return vars(self)["action_noise"]
+
+    @action_noise.setter
+    def action_noise(self, noise: ActionNoise | float | None) -> None:
+        n_envs, action_space = vars(self).get("n_envs", 1), vars(self).get("action_space")
+        if noise is not None and not isinstance(noise, ActionNoise):
+            sigma = check_number("action_noise (if not an ActionNoise or None)", noise, 0.0)
+            if action_space is not None:  # without one, a saved model is being loaded
+                shape = action_space.shape or (1,)
+                noise = NormalActionNoise(np.zeros(shape), np.full(shape, sigma))
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
+            noise = noise.base_noise
+        if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise) and n_envs > 1:
+            noise = VectorizedActionNoise(noise, n_envs)
+        vars(self)["action_noise"] = noise
 
     def _setup_fused_update(self) -> None:
         self._fused_update: FusedUpdate | None = None
@@ -271,18 +298,27 @@ class TDC(OffPolicyAlgorithm):
         print(f"Using the {update}, {loops}")
 
     def _setup_temperature(self) -> None:
-        self._target_entropy = (
-            -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
-            if self.target_entropy == "auto"
-            else float(self.target_entropy)
-        )
         initial = th.tensor([self._initial_ent_coef()], device=self.device)
-        if self._learns_ent_coef:
+        self.log_ent_coef = self.ent_coef_optimizer = self.ent_coef_tensor = None
+        self._built_ent_coef = self.ent_coef
+        if not self.stochastic_actor:
+            return
+        if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
             self.log_ent_coef = initial.log().requires_grad_(True)
             learning_rate = self._scheduled("learning_rate")
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=learning_rate, fused=True)
         else:
             self.ent_coef_tensor = initial
+
+    def _current_target_entropy(self) -> float:
+        if self.target_entropy == "auto":
+            return -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        return check_number('target_entropy (if not "auto")', self.target_entropy)
+
+    def _renew_temperature(self) -> None:
+        """Make the temperature that ``ent_coef`` asks for, where its owner has changed it."""
+        if self.ent_coef != self._built_ent_coef:
+            self._setup_temperature()
 
     # ---------------------------------------------------------------- Algorithm 1
 
@@ -296,6 +332,7 @@ class TDC(OffPolicyAlgorithm):
         :raises NonFiniteError: if a loss has been seen to be NaN or infinite
         """
         lam = self._scheduled("lam")
+        self._renew_temperature()
         self._update_learning_rates()
         fused_update = self._bind_fused_update(batch_size)
         if fused_update is None:
@@ -316,6 +353,7 @@ class TDC(OffPolicyAlgorithm):
                 update.update_targets()
             if self._n_updates % FLUSH_INTERVAL == 0:
                 self._flush_moments()
+        self._record_training()
 
     def _flush_moments(self) -> None:
         """Set moments of Adam to zero that are about to become denormal numbers."""
@@ -330,7 +368,7 @@ class TDC(OffPolicyAlgorithm):
         learning_rate = self._scheduled("learning_rate")
         update_learning_rate(self.actor.optimizer, learning_rate)  # type: ignore[arg-type]
         update_learning_rate(self.critic.optimizer, self._scheduled("qf_learning_rate"))
-        if self.stochastic_actor and self._learns_ent_coef:
+        if self.ent_coef_optimizer is not None:
             update_learning_rate(self.ent_coef_optimizer, learning_rate)
 
     def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
@@ -412,7 +450,7 @@ class TDC(OffPolicyAlgorithm):
         self.diagnose(actor_loss=actor_loss, entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
         if self._learns_ent_coef and self.log_ent_coef.requires_grad:
             # The loss −log α·mean(log π + H_target) is linear in log α
-            slope = -(log_prob + self._target_entropy).mean(dim=0, keepdim=True)
+            slope = -(log_prob + self._current_target_entropy()).mean(dim=0, keepdim=True)
             self.diagnose(ent_coef_loss=(self.log_ent_coef.detach() * slope).squeeze())
             self.log_ent_coef.grad = slope
             self.ent_coef_optimizer.step()
@@ -466,27 +504,44 @@ class TDC(OffPolicyAlgorithm):
             **{f"critic_{i + 1}_selected": (selected == i).float().mean() for i in range(mean.shape[1])},
         )
 
+    def _record_training(self) -> None:
+        """Leave in the logger what callbacks read there after ``train()``, as with every algorithm of SB3."""
+        logger = vars(self).get("_logger")
+        if logger is None:
+            return
+        for name in ("lam", "learning_rate", "qf_learning_rate"):
+            logger.record(f"train/{name}", self._scheduled(name))
+        logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._diagnostics.is_recorded = False
+        if self.device.type == "cpu":
+            self._diagnostics.record(logger)  # there is no device to wait for
+
+    @property
+    def logger(self) -> Logger:
+        """SB3's logger; what was measured in training is fetched from the device when somebody asks for the logger."""
+        if not self._diagnostics.is_recorded:
+            self._diagnostics.record(self._logger)
+        return self._logger
+
     def dump_logs(self) -> None:
-        """Write log data; what was measured in training since the last time is fetched from the device here."""
-        means = self._diagnostics.fetch()
-        for name, value in means.items():
-            self.logger.record(f"train/{name}", value)
-        if means:
-            for name in ("lam", "learning_rate", "qf_learning_rate"):
-                self.logger.record(f"train/{name}", self._scheduled(name))
-            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        """Write log data; the means of the training begin anew."""
         super().dump_logs()
+        self._diagnostics.restart()
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         fused = self._fused_update
         if fused is None or self.num_timesteps < learning_starts or not fused.acts():
-            return super()._sample_action(learning_starts, action_noise, n_envs)
-        assert isinstance(self._last_obs, np.ndarray)
-        scaled_action = fused.act(self._last_obs).reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+            _, scaled_action = super()._sample_action(learning_starts, None, n_envs)
+        else:
+            scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
+            scaled_action = scaled_action.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
         if action_noise is not None:
-            scaled_action = np.clip(scaled_action + action_noise(), -1, 1)
+            noise = action_noise()
+            if not self.action_space.shape:  # or (n,) and (n, 1) would be added to (n, n)
+                noise = noise.reshape(scaled_action.shape)
+            scaled_action = np.clip(scaled_action + noise, -1, 1)
         return self.policy.unscale_action(scaled_action), scaled_action
 
     def _store_transition(
@@ -499,11 +554,15 @@ class TDC(OffPolicyAlgorithm):
         infos: list[dict[str, Any]],
     ) -> None:
         observations = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
-        arrays = [("action", buffer_action), ("reward", reward), *observations.items()]
+        values: list[tuple[str, Any]] = [("action", buffer_action), ("reward", reward), *observations.items()]
         for info in (info for info, done in zip(infos, dones, strict=True) if done):
-            last = info.get("terminal_observation", {})  # new_obs is the first of the next episode already
-            arrays += (last if isinstance(last, dict) else {"terminal observation": np.asarray(last)}).items()
-        for name, array in arrays:
+            last = info.get("terminal_observation")  # new_obs is the first of the next episode already
+            if isinstance(last, dict):
+                values += [(name, last[name]) for name in observations if name in last]
+            else:
+                values.append(("terminal observation", last))
+        for name, value in values:
+            array = np.asarray(value)  # environments may return numbers and lists
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
                 source = "policy chose an" if name == "action" else "environment returned a non-finite"
@@ -526,6 +585,33 @@ class TDC(OffPolicyAlgorithm):
 
     # ---------------------------------------------------------------- saving
 
+    @classmethod
+    def load(
+        cls: type[SelfTDC],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        *args: Any,
+        **kwargs: Any,
+    ) -> SelfTDC:
+        """
+        Load the model from a zip-file, as SB3 does.
+
+        :param kwargs: attributes to set over the file's; another ``ent_coef`` than the file's also replaces its
+            temperature
+        """
+        given = {**(custom_objects or {}), **kwargs}
+        custom_objects, kwargs = (
+            {name: value for name, value in objects.items() if name != "ent_coef"}
+            for objects in (custom_objects or {}, kwargs)
+        )
+        model = super().load(path, env, device, custom_objects, *args, **kwargs)
+        if "ent_coef" in given:
+            model.ent_coef = given["ent_coef"]
+            model._renew_temperature()
+        return model
+
     def save(
         self,
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -540,23 +626,24 @@ class TDC(OffPolicyAlgorithm):
         :param include: name of parameters that might be excluded but should be included anyway
         :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
         """
-        weights = dict(self.policy.state_dict())
-        if self.stochastic_actor:
-            weights["ent_coef"] = self.current_ent_coef()
-        broken = [name for name, weight in weights.items() if not weight.isfinite().all()]
+        self._renew_temperature()
+        broken = find_non_finite(self.policy, self.policy.state_dict())
+        if self.stochastic_actor and not self.current_ent_coef().isfinite():
+            broken.append("ent_coef")
         if broken:
             raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        return [*super()._excluded_save_params(), *networks, "_obstacles", "_diagnostics", "_fused_update"]
+        derived = ["_obstacles", "_diagnostics", "_fused_update", "_built_ent_coef", "_scheduled_learning_rate"]
+        return [*super()._excluded_save_params(), *networks, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
         if not self.stochastic_actor:
             return state_dicts, []
-        if not self._learns_ent_coef:
+        if self.ent_coef_optimizer is None:
             return state_dicts, ["ent_coef_tensor"]
         return [*state_dicts, "ent_coef_optimizer"], ["log_ent_coef"]
 
