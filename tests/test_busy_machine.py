@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch as th
 
-from sb3_tdc import busy_machine, train
+from sb3_tdc import TDC, busy_machine, train
 from sb3_tdc.busy_machine import BusyMachine
+from sb3_tdc.checkpoint import Checkpoints
 
 SMALL = ["policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
 
@@ -174,6 +175,25 @@ def test_train_prints_the_command_that_helps(tmp_path, capsys, busy, bar):
     assert lines[said].endswith("press Ctrl-C, then")
     folder = tmp_path / "my logs" / "tdc" / "Pendulum-v1_1"
     assert lines[said + 1] == f"  python train.py --resume '{folder}' --num-threads 1"
+
+
+def test_checkpoints_of_a_real_run_do_not_count(tmp_path, capsys, monkeypatch):
+    """The clocks move while a checkpoint is written, as far as in ``busy``, and by 1 s in an update."""
+    passed = 0.0
+
+    def pass_time(seconds):
+        nonlocal passed
+        passed += seconds
+
+    update, write = TDC.train, Checkpoints._save
+    monkeypatch.setattr(TDC, "train", lambda *args, **kwargs: (pass_time(1), update(*args, **kwargs)))
+    monkeypatch.setattr(Checkpoints, "_save", lambda *args: (write(*args), pass_time(100)))
+    clocks = SimpleNamespace(perf_counter=lambda: passed, process_time=lambda: passed)
+    monkeypatch.setattr(busy_machine, "time", clocks)
+    monkeypatch.setattr(busy_machine, "th", SimpleNamespace(get_num_threads=lambda: 2))
+    assert run_train(tmp_path, "--checkpoint-freq", "2", "--no-progress") == 0
+    assert passed > 100 * 100
+    assert "An update takes" not in capsys.readouterr().out
 
 
 def test_without_checkpoints_there_is_another_command(tmp_path, capsys, busy):
