@@ -35,6 +35,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from sb3_tdc.busy_machine import BusyMachine
 from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable
 from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.hyperparams import Hyperparams
@@ -207,6 +208,7 @@ def train(experiment: Experiment) -> Outcome:
             if checkpoints is not None:
                 callbacks.insert(0, checkpoints)
                 checkpoints.restore(model)
+            callbacks.insert(0, BusyMachine(progress.say, _remedy(experiment)))
         except BaseException as error:
             stack.close()
             if not experiment.resume:
@@ -227,6 +229,13 @@ def train(experiment: Experiment) -> Outcome:
             if checkpoints is not None:
                 checkpoints.store.remove_all()
         return Outcome(model, stop.requested, checkpoints.last_step if checkpoints is not None else None)
+
+
+def _remedy(experiment: Experiment) -> str:
+    """What a run does that is to continue on one thread."""
+    if experiment.checkpoint_freq > 0:
+        return f"press Ctrl-C, then\n  {experiment.folder.command_to_resume} --num-threads 1"
+    return "press Ctrl-C, and add --num-threads 1 to the command that is printed then."
 
 
 def _open_checkpoints(experiment: Experiment) -> Checkpoints | None:

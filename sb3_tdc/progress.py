@@ -63,6 +63,13 @@ class ProgressCallback(BaseCallback):
             self.bar.close()
             self.bar = None
 
+    def say(self, text: str) -> None:
+        """Print a message, above the bar if there is one."""
+        if self.bar is not None:
+            self.bar.write(text)
+        elif self.verbose > 0:
+            print(text, flush=True)
+
     def show_evaluation(self, evaluation: EvalCallback) -> None:
         """Show the evaluation that has just ended."""
         returns = evaluation.evaluations_results[-1]

@@ -96,6 +96,10 @@ class RunFolder:
         return self.path / "checkpoints"
 
     @property
+    def command_to_resume(self) -> str:
+        return f"python train.py --resume {shlex.quote(str(self.path))}"
+
+    @property
     def is_finished(self) -> bool:
         return self._finished.is_file()
 

@@ -226,7 +226,7 @@ def _say_how_to_go_on(
     folder = experiment.folder
     if outcome.checkpoint is not None:
         print(f"Stopped at step {steps:,} of {total:,}. To go on from step {outcome.checkpoint:,}:")
-        print(f"  python train.py --resume {shlex.quote(str(folder.path))}")
+        print(f"  {folder.command_to_resume}")
     else:
         experience = "with" if args.save_replay_buffer else "without (--save-replay-buffer keeps it)"
         print(f"Stopped at step {steps:,} of {total:,}. To go on in a new run, {experience} the replay buffer:")

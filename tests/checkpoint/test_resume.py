@@ -22,7 +22,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_tdc import TDC, interruption, train
+from sb3_tdc import TDC, busy_machine, interruption, train
 from sb3_tdc.checkpoint import Checkpoints, NotCapturedError, Restorable, callback, state
 from sb3_tdc.progress import ProgressCallback
 from tests.checkpoint import kill
@@ -95,6 +95,33 @@ def test_a_signal_loses_nothing(tmp_path, stop_at, monkeypatch, whole, capsys):
     assert "Going on from step 270" in screen
     assert outcome(stopped) == whole
     assert not (stopped / "checkpoints").exists()  # of no use any more
+
+
+def test_a_run_on_a_busy_machine_goes_on_with_another_number_of_threads(tmp_path, monkeypatch, whole):
+    """Stopped when it says that one thread is faster. The threads are told, not changed, so that the results stay."""
+    threads, messages = [2], []
+
+    def say(progress, text):
+        messages.append(text)
+        if len(messages) == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(th, "get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr(th, "set_num_threads", threads.append)
+    with monkeypatch.context() as busy:
+        busy.setattr(busy_machine, "_WINDOW_SECONDS", 0.0)
+        busy.setattr(busy_machine, "_SHARE", float("inf"))
+        busy.setattr(busy_machine, "_WASTE", 0.0)
+        busy.setattr(ProgressCallback, "say", say)
+        assert run_train(tmp_path, "--num-threads", "2") == 130
+        stopped = tmp_path / "tdc" / "Hopper-v4_1"
+        shutil.copytree(stopped, tmp_path / "copy")
+        assert resume(tmp_path / "copy") == 0
+        assert len(messages) == 2  # a process does not know what the one before has said
+    time.sleep(1)  # TensorBoard reads the files of one process and one second in the order of their names: 10 before 8
+    with pytest.warns(RuntimeWarning, match="threads of torch was 2, is 1"):
+        assert resume(stopped, "--num-threads", "1") == 0
+    assert outcome(stopped) == whole
 
 
 def test_a_finished_run_is_left_alone(tmp_path, capsys):
