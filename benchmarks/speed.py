@@ -164,24 +164,31 @@ def repeat(function: Callable[[], Any]) -> Callable[[int], None]:
 
 
 def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], None]]:
-    """
-    Return functions for :func:`time_calls`, by name: the gradient steps of a model, the same without the comparison of
-    everything they rely on, and the matrix products of one.
-    """
-
-    def fits(*_: Any) -> bool:
-        return True
-
-    def train_unchecked(n: int) -> None:
-        with mock.patch.object(type(model._fused_update), "fits", fits):
-            for _ in range(n):
-                model.train(1, batch_size)
-
+    """Return functions for :func:`time_calls`, by name: the gradient steps of a model, and the matrix products of one."""
     return {
         "TDC": repeat(lambda: model.train(1, batch_size)),
-        "without the comparison": train_unchecked,
         "matrix products": repeat(matrix_products(model)),
     }
+
+
+def comparison_share(model: Any, steps: int = 500) -> float:
+    """Return the share of training steps spent on comparing what the fused update relies on with what it was."""
+    cls, times = type(model._fused_update), []
+    fits = cls.fits
+
+    def timed_fits(*arguments: Any) -> bool:
+        start = time.perf_counter()
+        result = fits(*arguments)
+        times.append(time.perf_counter() - start)
+        return result
+
+    updates = []
+    with mock.patch.object(cls, "fits", timed_fits):
+        for _ in range(steps):
+            start = time.perf_counter()
+            model.train(1, 256)
+            updates.append(time.perf_counter() - start)
+    return float(np.median(times) / np.mean(updates))
 
 
 def learn_steps(name: str, model: Any) -> Callable[[int], None]:
@@ -209,6 +216,7 @@ def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
     return {
         "steps": step_times,
         "gradient": gradient_times,
+        "comparison": comparison_share(tdc),
         "foreign_load": load.foreign,
     }
 

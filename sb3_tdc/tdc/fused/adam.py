@@ -55,9 +55,9 @@ class AdamStep:
         )
 
     def show_gradients(self) -> None:
-        """Let each parameter's ``grad`` be its gradient, whatever has been done to it since the last step."""
-        for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
-            if parameter.grad is not gradient:
+        """Let each parameter's ``grad`` be its gradient again, if somebody has set it to None."""
+        if self.parameters[0].grad is not self.gradients[0]:
+            for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
                 parameter.grad = gradient
 
     def update_targets(self, tau: float) -> None:

@@ -16,21 +16,19 @@ from sb3_tdc.tdc.policies import QuantileCritic, StackedLinear, TDCPolicy
 
 th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
 
-# Methods whose work the fused update does itself, as they were when this module was imported: (class, name) → function
-REPLACED_METHODS: dict[tuple[type, str], Any] = {
-    (cls, name): getattr(cls, name)
+# Methods whose work the fused update does itself, as they were when this module was imported: class → name → function
+REPLACED_METHODS: dict[type, dict[str, Any]] = {
+    cls: {name: getattr(cls, name) for name in names}
     for cls, names in {
-        TDCPolicy: ("forward", "predict", "_predict", "scale_action", "unscale_action", "obs_to_tensor"),
-        DeterministicActor: ("forward", "_predict", "extract_features"),
-        TanhGaussianActor: ("forward", "_predict", "extract_features", "get_action_dist_params", "action_log_prob"),
-        QuantileCritic: ("forward", "q1_forward", "extract_features"),
+        TDCPolicy: ("predict", "_predict"),
+        DeterministicActor: ("forward", "_predict"),
+        TanhGaussianActor: ("forward", "_predict", "get_action_dist_params", "action_log_prob"),
+        QuantileCritic: ("forward", "q1_forward"),
         StackedLinear: ("forward", "forward_first"),
-        FlattenExtractor: ("forward",),
-        **dict.fromkeys((nn.Sequential, nn.Linear, nn.ReLU, nn.Tanh, nn.Flatten), ("forward",)),
-        nn.Module: ("__call__", "_call_impl"),
+        **dict.fromkeys((nn.Sequential, nn.Linear, nn.ReLU, nn.Tanh, nn.Flatten, FlattenExtractor), ("forward",)),
+        nn.Module: ("__call__",),
         th.optim.Adam: ("step",),
     }.items()
-    for name in names
 }
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 _OPTIMIZER_HOOKS = ("_optimizer_step_pre_hooks", "_optimizer_step_post_hooks")
@@ -50,7 +48,10 @@ def obstacles(model: Any) -> list[str]:
     """
     policy, space = model.policy, model.observation_space
     found = [f"{name} is overridden" for name in model.overridden_methods()]
-    found += [f"{cls.__name__}.{name} is replaced" for cls, name in REPLACED_METHODS if _is_replaced(cls, name)]
+    for cls, methods in REPLACED_METHODS.items():
+        found += [
+            f"{cls.__name__}.{name} is replaced" for name, own in methods.items() if getattr(cls, name) is not own
+        ]
     if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
         found.append("the observations are not flat vectors")
     networks = {"actor": policy.actor, "critic": policy.critic}
@@ -75,10 +76,6 @@ def obstacles(model: Any) -> list[str]:
     elif model.device.type not in ("cpu", "cuda"):
         found.append(f"the device is {model.device}")
     return found
-
-
-def _is_replaced(cls: type, name: str) -> bool:
-    return getattr(cls, name) is not REPLACED_METHODS[cls, name]
 
 
 def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:

@@ -42,8 +42,8 @@ class FusedUpdate:
         self.model, self.batch_size = model, batch_size
         self.critic_adam = AdamStep(model.critic, model.critic_target)
         self.actor_adam = AdamStep(model.actor, model.actor_target)
-        self.snapshot, self.actor_snapshot = Snapshot(model), ModuleSnapshot(model.actor.modules())
-        self.constants = self._read_constants()
+        self.snapshot = Snapshot(model)
+        self.actor, self.actor_snapshot = model.actor, ModuleSnapshot(model.actor.modules())
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
         self.packed_replay = packed_replay
         self.bind = Passes(load_kernels() if model.device.type == "cpu" else None)
@@ -120,14 +120,9 @@ class FusedUpdate:
         """Return the layers of the online network, of the target, and of the gradient."""
         return [make_layers(tensors) for tensors in (adam.values, adam.targets, adam.gradients)]
 
-    def _read_constants(self) -> tuple[Any, ...]:
-        """What is read from Python in a part of an update, and so stays as it was in a CUDA graph."""
-        model = self.model
-        return model.kappa, model.tau, model.target_policy_noise, model.target_noise_clip
-
     def fits(self, batch_size: int) -> bool:
         """Return whether the buffers are of this size, and all that an update relies on is as it was."""
-        return batch_size == self.batch_size and self.constants == self._read_constants() and self.snapshot.is_current()
+        return batch_size == self.batch_size and self.snapshot.is_current()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> None:
         """Return None: a copy of the model binds an update to its own networks."""
@@ -163,7 +158,7 @@ class FusedUpdate:
     def acts(self) -> bool:
         """Return whether :meth:`act` is what the policy does."""
         model = self.model
-        return model.policy.actor is self.snapshot.networks[0] and self.actor_snapshot.is_current()
+        return model.policy.actor is self.actor and self.actor_snapshot.is_current()
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
