@@ -164,7 +164,7 @@ def repeat(function: Callable[[], Any]) -> Callable[[int], None]:
 
 
 def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], None]]:
-    """Return functions for :func:`time_calls`, by name: the gradient steps of a model, and the matrix products of one."""
+    """Return functions for :func:`time_calls`: the gradient steps of a model, and the matrix products of one."""
     return {
         "TDC": repeat(lambda: model.train(1, batch_size)),
         "matrix products": repeat(matrix_products(model)),
