@@ -46,9 +46,6 @@ def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float])
     cells += [quartiles(ratios(g[_TDC], g["matrix products"])) for g in gradient]
     cells += ["≤ 1.6 (2t), ≤ 1.45 (1t)", *(f"{np.median(g[_TDC]):.1f}" for g in gradient)]
     lines.append("| " + " | ".join(cells) + " |")
-    cells = ["comparison of what the update relies on / gradient step"]
-    cells += [f"{100 * results[n]['comparison']:.1f} %" for n in threads]
-    lines.append("| " + " | ".join([*cells, "< 1 %", *("" for _ in threads)]) + " |")
     load = ", ".join(f"{results[n]['foreign_load']:.2f} ({n}t)" for n in threads)
     return [*lines, "", f"Load by other processes meanwhile, in cores: {load}."]
 

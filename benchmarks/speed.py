@@ -171,26 +171,6 @@ def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], Non
     }
 
 
-def comparison_share(model: Any, steps: int = 500) -> float:
-    """Return the share of training steps spent on comparing what the fused update relies on with what it was."""
-    cls, times = type(model._fused_update), []
-    fits = cls.fits
-
-    def timed_fits(*arguments: Any) -> bool:
-        start = time.perf_counter()
-        result = fits(*arguments)
-        times.append(time.perf_counter() - start)
-        return result
-
-    updates = []
-    with mock.patch.object(cls, "fits", timed_fits):
-        for _ in range(steps):
-            start = time.perf_counter()
-            model.train(1, 256)
-            updates.append(time.perf_counter() - start)
-    return float(np.median(times) / np.mean(updates))
-
-
 def learn_steps(name: str, model: Any) -> Callable[[int], None]:
     """Return a function that trains a model for a number of steps."""
 
@@ -216,7 +196,6 @@ def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
     return {
         "steps": step_times,
         "gradient": gradient_times,
-        "comparison": comparison_share(tdc),
         "foreign_load": load.foreign,
     }
 

@@ -381,7 +381,7 @@ class TDC(OffPolicyAlgorithm):
             return None
         known, self._obstacles = self._obstacles, obstacles(self)
         if not self._obstacles:
-            self._fused_update = FusedUpdate(self, batch_size, bound.packed_replay if bound is not None else None)
+            self._fused_update = FusedUpdate(self, batch_size)
         elif self.fused:
             raise ValueError(self._obstacle_message())
         if self.verbose > 0 and known != self._obstacles:

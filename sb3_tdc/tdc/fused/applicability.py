@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn.modules import module as global_hooks
 from torch.optim import optimizer as global_optimizer_hooks
 
-from sb3_tdc.tdc.policies import QuantileCritic, StackedLinear, TDCPolicy
+from sb3_tdc.tdc.policies import QuantileCritic, StackedLinear, TanhGaussian, TDCPolicy
 
 th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
 
@@ -22,6 +22,7 @@ REPLACED_METHODS: dict[type, dict[str, Any]] = {
     for cls, names in {
         TDCPolicy: ("predict", "_predict"),
         DeterministicActor: ("forward", "_predict"),
+        TanhGaussian: ("actions_from_params", "log_prob_from_params"),
         TanhGaussianActor: ("forward", "_predict", "get_action_dist_params", "action_log_prob"),
         QuantileCritic: ("forward", "q1_forward"),
         StackedLinear: ("forward", "forward_first"),
@@ -100,7 +101,7 @@ def _stacks(network: Any) -> list[Any] | None:
         return _linear_layers(list(network.layers), StackedLinear, [])
     if type(network) is DeterministicActor:
         return _linear_layers(list(network.mu), nn.Linear, [nn.Tanh]) if type(network.mu) is nn.Sequential else None
-    if type(network.latent_pi) is not nn.Sequential or network.use_sde or type(network.mu) is not nn.Linear:
+    if type(network.latent_pi) is not nn.Sequential or type(network.action_dist) is not TanhGaussian:
         return None
     return _linear_layers([*network.latent_pi, network.mu, network.log_std], nn.Linear, [], n_outputs=2)
 

@@ -1,11 +1,14 @@
 """A replay buffer whose transitions lie in one place each."""
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
 _ARRAYS = ("observations", "actions", "next_observations", "rewards", "dones", "timeouts")
-_METHODS = {"sample", "_get_samples"}  # what is not done here if somebody has put another in the place of SB3's
+# What is not done here if somebody has put another in the place of SB3's
+_METHODS = {name: getattr(ReplayBuffer, name) for name in ("sample", "_get_samples")}
 
 
 def row_widths(obs_dim: int, action_dim: int) -> list[int]:
@@ -45,15 +48,29 @@ class PackedReplay:
         part[filled] = array[filled]
         setattr(self.buffer, name, part)
 
+    @classmethod
+    def of(cls, buffer: ReplayBuffer) -> "PackedReplay | None":
+        """Return the rows of a buffer, made once for all models that share it, or None where there can be none."""
+        packed = _PACKED.get(buffer)
+        if packed is None or not packed.holds(buffer):
+            if not cls.applies(buffer):
+                return None
+            packed = _PACKED[buffer] = cls(buffer)
+        return packed
+
     @staticmethod
     def applies(buffer: ReplayBuffer) -> bool:
-        """:return: whether ``sample`` of this buffer is SB3's plain one, of flat observations of real numbers"""
+        """
+        Return whether ``sample`` of this buffer is SB3's plain one, of flat observations of real numbers in arrays that
+        nobody else writes to or keeps: not in a file, in shared memory, or parts of others.
+        """
         return (
             type(buffer) is ReplayBuffer
-            and not _METHODS & vars(buffer).keys()
+            and _samples_plainly(buffer)
             and not buffer.optimize_memory_usage
             and buffer.observations.ndim == 3
             and buffer.observations.dtype.kind == buffer.actions.dtype.kind == "f"
+            and all(_is_private(getattr(buffer, name)) for name in _ARRAYS)
         )
 
     def holds(self, buffer: ReplayBuffer) -> bool:
@@ -61,7 +78,7 @@ class PackedReplay:
         return (
             self.buffer is buffer
             and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)
-            and not _METHODS & vars(buffer).keys()
+            and _samples_plainly(buffer)
         )
 
     def draw(self, n: int, steps: int) -> np.ndarray:
@@ -95,3 +112,17 @@ class PackedReplay:
     def _copy_rows(self, start: int, stop: int) -> None:
         rows = slice(start * self.buffer.n_envs, stop * self.buffer.n_envs)
         self.rows[rows] = self.host_rows[rows].to(self.rows.device)
+
+
+# Weak keys: a buffer's rows end with it
+_PACKED: "WeakKeyDictionary[ReplayBuffer, PackedReplay]" = WeakKeyDictionary()
+
+
+def _samples_plainly(buffer: ReplayBuffer) -> bool:
+    own = all(getattr(ReplayBuffer, name) is method for name, method in _METHODS.items())
+    return own and _METHODS.keys().isdisjoint(vars(buffer))
+
+
+def _is_private(array: np.ndarray) -> bool:
+    # An array that was unpickled may lie in bytes, which nobody can write to
+    return type(array) is np.ndarray and (array.base is None or isinstance(array.base, bytes))

@@ -7,12 +7,13 @@ objects as possible are looked at: of a module its children, its parameters and 
 where a method is replaced on the instance); of hooks, only how many have been registered in this process.
 """
 
+import gc
 import operator
 from collections.abc import Iterable
-from itertools import chain
 from typing import Any
 
 import torch as th
+from stable_baselines3.sac.policies import Actor as TanhGaussianActor
 from torch import nn
 from torch.utils.hooks import RemovableHandle
 
@@ -26,12 +27,6 @@ _settings_of = operator.attrgetter(
     *("kappa", "tau", "target_policy_noise", "target_noise_clip"),
 )
 _requires_grad = operator.attrgetter("requires_grad")
-_METHODS_OF = [(cls, operator.attrgetter(*methods)) for cls, methods in REPLACED_METHODS.items()]
-_METHODS = [methods_of(cls) for cls, methods_of in _METHODS_OF]
-
-
-def _values(contents: list[dict[Any, Any]]) -> list[Any]:
-    return list(chain.from_iterable(map(dict.values, contents)))
 
 
 def _equal(current: list[Any], copy: list[Any]) -> bool:
@@ -51,19 +46,23 @@ class ModuleSnapshot:
     def __init__(self, modules: Iterable[nn.Module]):
         modules = list(modules)
         self.n_hooks = RemovableHandle.next_id
-        self.attributes = [vars(module) for module in modules]
+        self.stochastic = [module for module in modules if isinstance(module, TanhGaussianActor)]
+        self.distributions = [actor.action_dist for actor in self.stochastic]
+        self.attributes = [vars(part) for part in (*modules, *self.distributions)]
         self.n_attributes = list(map(len, self.attributes))
         self.contents = [d for module in modules for d in (module._modules, module._parameters) if d]
-        self.values = _values(self.contents)
+        self.values = gc.get_referents(*self.contents)
         self.parameters = [p for module in modules for p in module._parameters.values() if p is not None]
         self.storage = list(map(th.Tensor.data_ptr, self.parameters))
 
     def is_current(self) -> bool:
         """Return whether the modules are the same; a hook registered anywhere counts as a change."""
+        # What dictionaries refer to is their values, in order: the fastest way to look at all of them
         return (
             RemovableHandle.next_id == self.n_hooks
             and list(map(len, self.attributes)) == self.n_attributes
-            and _equal(_values(self.contents), self.values)
+            and [actor.action_dist for actor in self.stochastic] == self.distributions
+            and _equal(gc.get_referents(*self.contents), self.values)
             and list(map(th.Tensor.data_ptr, self.parameters)) == self.storage
         )
 
@@ -84,10 +83,14 @@ class Snapshot:
         self.contents: list[dict[Any, Any]] = []
         for optimizer in optimizers:
             self.contents += [vars(optimizer), optimizer.state, *optimizer.state.values()]
-        self.values = _values(self.contents)
+        self.values = gc.get_referents(*self.contents)
         self.groups = [optimizer.param_groups[0] for optimizer in optimizers]
         self.options = [(list(params), *rest) for params, *rest in map(_options_of, self.groups)]
         self.learning = [parameter for params, *_ in self.options for parameter in params]
+        parts = [*policy.modules(), *self.modules.distributions, *optimizers]
+        classes = {nn.Module, *map(type, parts)} & REPLACED_METHODS.keys()
+        self.methods_of = [(cls, operator.attrgetter(*REPLACED_METHODS[cls])) for cls in classes]
+        self.methods = [methods_of(cls) for cls, methods_of in self.methods_of]
         self.overridden = model.overridden_methods
 
     def is_current(self) -> bool:
@@ -95,9 +98,9 @@ class Snapshot:
         return (
             _settings_of(self.model) == self.settings
             and self.modules.is_current()
-            and _equal(_values(self.contents), self.values)
+            and _equal(gc.get_referents(*self.contents), self.values)
             and _equal(list(map(_options_of, self.groups)), self.options)
             and all(map(_requires_grad, self.learning))
-            and [methods_of(cls) for cls, methods_of in _METHODS_OF] == _METHODS
+            and [methods_of(cls) for cls, methods_of in self.methods_of] == self.methods
             and not self.overridden()
         )

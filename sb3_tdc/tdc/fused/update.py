@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from sb3_tdc.tdc.tdc import TDC
 
 
+_COLUMNS = ("observations", "actions", "next_observations", "dones", "rewards")
+
+
 def _call(function: Callable[[], Any]) -> Any:
     return function()
 
@@ -35,21 +38,18 @@ class FusedUpdate:
 
     :param model: for which :func:`obstacles` found nothing; its parameters become views
     :param batch_size: B
-    :param packed_replay: of an update before this one; it counts where it still holds the model's replay buffer
     """
 
-    def __init__(self, model: "TDC", batch_size: int, packed_replay: PackedReplay | None = None):
+    def __init__(self, model: "TDC", batch_size: int):
         self.model, self.batch_size = model, batch_size
         self.critic_adam = AdamStep(model.critic, model.critic_target)
         self.actor_adam = AdamStep(model.actor, model.actor_target)
         self.snapshot = Snapshot(model)
         self.actor, self.actor_snapshot = model.actor, ModuleSnapshot(model.actor.modules())
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
-        self.packed_replay = packed_replay
+        self.packed_replay: PackedReplay | None = None
         self.bind = Passes(load_kernels() if model.device.type == "cpu" else None)
         self._make_buffers(model.policy.actor.features_dim, get_action_dim(model.critic.action_space))
-        if packed_replay is not None:
-            self.gather = self._bind_gather(packed_replay)
         self._make_critics()
         self._make_actors()
 
@@ -144,10 +144,9 @@ class FusedUpdate:
         if self.model._vec_normalize_env is not None:
             return None
         if self.packed_replay is None or not self.packed_replay.holds(buffer):
-            if not PackedReplay.applies(buffer):
-                return None
-            self.packed_replay = PackedReplay(buffer)
-            self.gather = self._bind_gather(self.packed_replay)
+            self.packed_replay = PackedReplay.of(buffer)
+            if self.packed_replay is not None:
+                self.gather = self._bind_gather(self.packed_replay)
         return self.packed_replay
 
     def _bind_gather(self, packed: PackedReplay) -> Callable[..., Any]:
@@ -186,8 +185,8 @@ class FusedUpdate:
         self.lam.set(lam)
         self.critic_adam.read_learning_rate()
         if replay_data is not self.minibatch:
-            for mine, other in zip(self.minibatch[:5], replay_data[:5], strict=True):
-                mine.copy_(other)
+            for name in _COLUMNS:  # by name: a custom minibatch may have them in another order
+                getattr(self.minibatch, name).copy_(getattr(replay_data, name))
         if discounts is None:
             self.discounts.set(model.gamma)
         else:

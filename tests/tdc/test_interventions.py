@@ -1,0 +1,506 @@
+"""Whatever a user does to a model counts from the next update on, with the fused update as with the readable one."""
+
+import copy
+import pickle
+from multiprocessing import shared_memory
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from torch import nn
+from torch.nn.modules.module import register_module_forward_hook
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+from sb3_tdc import TDC
+from sb3_tdc.tdc.fused.replay import PackedReplay
+from sb3_tdc.tdc.policies import TanhGaussian
+from tests.tdc.test_fused import assert_close, states
+from tests.tdc.test_tdc import HEADS, make
+from tests.tdc.test_update import ACT, BatchQueue, TwoActions, make_model, random_batches
+
+CALLS: list[str] = []
+
+
+@pytest.fixture(autouse=True)
+def forget_calls():
+    CALLS.clear()
+
+
+def last_layer_of_actor(model):
+    sequential = model.actor.latent_pi if model.stochastic_actor else model.actor.mu
+    index = max(i for i, module in enumerate(sequential) if isinstance(module, nn.Linear))
+    return sequential, index
+
+
+def with_optimizer(model, network):
+    network.optimizer = th.optim.Adam(network.parameters(), lr=3e-4)
+
+
+# ---- each changes a model, and leaves a trace in CALLS if it is called
+
+
+def replace_a_layer(model):
+    sequential, index = last_layer_of_actor(model)
+    th.manual_seed(7)
+    sequential[index] = nn.Linear(sequential[index].in_features, sequential[index].out_features)
+    with_optimizer(model, model.actor)
+
+
+def replace_a_layer_and_keep_the_optimizer(model):
+    sequential, index = last_layer_of_actor(model)
+    sequential[index] = copy.deepcopy(sequential[index])  # nothing trains it now
+
+
+def replace_the_layers_of_the_critic(model):
+    th.manual_seed(8)
+    fresh = TDC("MlpPolicy", model.env, policy_kwargs=model.policy_kwargs, seed=9, device="cpu")
+    model.critic.layers = fresh.critic.layers
+    with_optimizer(model, model.critic)
+
+
+def replace_an_activation(model):
+    sequential, index = last_layer_of_actor(model)
+    sequential[index - 1] = nn.Tanh()
+
+
+def insert_a_layer(model):
+    sequential, index = last_layer_of_actor(model)
+    sequential[index - 1] = nn.Sequential(nn.ReLU(), nn.Identity())
+
+
+def replace_the_extractor(model):
+    class Half(type(model.actor.features_extractor)):
+        def forward(self, observations):
+            CALLS.append("extractor")
+            return super().forward(observations) / 2
+
+    model.actor.features_extractor = Half(model.observation_space)
+
+
+def optimize_the_last_layer_only(model):
+    sequential, index = last_layer_of_actor(model)
+    model.actor.optimizer = th.optim.Adam(sequential[index].parameters(), lr=1e-2)
+
+
+def optimize_in_another_order(model):
+    model.critic.optimizer = th.optim.Adam(list(model.critic.parameters())[::-1], lr=1e-2)
+
+
+def add_a_group(model):
+    first, *others = model.critic.parameters()
+    model.critic.optimizer = th.optim.Adam([{"params": [first], "lr": 1e-2}, {"params": others}], lr=1e-3)
+
+
+def replace_the_optimizers_step(model):
+    optimizer = model.critic.optimizer
+    own = optimizer.step
+
+    def step(*args, **kwargs):
+        CALLS.append("step")
+        return own(*args, **kwargs)
+
+    optimizer.step = step
+
+
+def hook_a_parameter(model):
+    def scale(gradient):
+        CALLS.append("parameter hook")
+        return gradient * 0.5
+
+    next(model.critic.parameters()).register_hook(scale)
+
+
+def hook_after_accumulation(model):
+    next(model.actor.parameters()).register_post_accumulate_grad_hook(lambda p: CALLS.append("accumulated"))
+
+
+def hook_an_optimizer_step(model):
+    model.actor.optimizer.register_step_pre_hook(lambda *_: CALLS.append("before the step"))
+    model.critic.optimizer.register_step_post_hook(lambda *_: CALLS.append("after the step"))
+
+
+def hook_a_module_backwards(model):
+    model.critic.layers[0].register_full_backward_hook(lambda *_: CALLS.append("backward"))
+
+
+def replace_a_method_of_the_model(model):
+    own = model.update_actor
+
+    def update_actor(replay_data):
+        CALLS.append("update_actor")
+        own(replay_data)
+
+    model.update_actor = update_actor
+
+
+def replace_minimize(model):
+    def minimize(output, optimizer, slope=None):
+        CALLS.append("minimize")
+        TDC._minimize(output, optimizer, slope)
+
+    model._minimize = minimize
+
+
+def replace_forward(model):
+    own = model.actor.forward
+
+    def forward(*args, **kwargs):
+        CALLS.append("forward")
+        return own(*args, **kwargs)
+
+    model.actor.forward = forward
+
+
+def replace_the_forward_of_a_layer(model):
+    layer = model.critic.layers[0]
+    own = layer.forward
+
+    def forward(inputs):
+        CALLS.append("layer")
+        return own(inputs) * 0.5
+
+    layer.forward = forward
+
+
+def replace_the_data_of_a_parameter(model):
+    for parameter in model.critic.parameters():
+        parameter.data = parameter.data * 0.5
+
+
+def freeze_a_layer(model):
+    model.critic.layers[0].weight.requires_grad_(False)
+
+
+CHANGES = [
+    replace_a_layer,
+    replace_a_layer_and_keep_the_optimizer,
+    replace_the_layers_of_the_critic,
+    replace_an_activation,
+    insert_a_layer,
+    replace_the_extractor,
+    optimize_the_last_layer_only,
+    optimize_in_another_order,
+    add_a_group,
+    replace_the_optimizers_step,
+    hook_a_parameter,
+    hook_after_accumulation,
+    hook_an_optimizer_step,
+    hook_a_module_backwards,
+    replace_a_method_of_the_model,
+    replace_minimize,
+    replace_forward,
+    replace_the_forward_of_a_layer,
+    replace_the_data_of_a_parameter,
+    freeze_a_layer,
+]
+CALLED = {
+    replace_the_extractor: "extractor",
+    replace_the_optimizers_step: "step",
+    hook_a_parameter: "parameter hook",
+    hook_after_accumulation: "accumulated",
+    hook_an_optimizer_step: "before the step",
+    hook_a_module_backwards: "backward",
+    replace_a_method_of_the_model: "update_actor",
+    replace_minimize: "minimize",
+    replace_forward: "forward",
+    replace_the_forward_of_a_layer: "layer",
+}
+
+
+def train(model, seed, n=6, batch=16):
+    model.replay_buffer = BatchQueue(random_batches(n, seed=seed, batch=batch))
+    th.manual_seed(seed)
+    model.train(gradient_steps=n, batch_size=batch)
+
+
+@HEADS
+@pytest.mark.parametrize("before", [False, True], ids=["before the first update", "in mid-run"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_counts_from_the_next_update_on(change, before, stochastic_actor):
+    finals, calls = [], []
+    for fused in (None, False):
+        CALLS.clear()
+        model = make_model(stochastic_actor=stochastic_actor, fused=fused)
+        if before:
+            train(model, 1)
+            assert (model._fused_update is None) is (fused is False)
+        change(model)
+        for i in (2, 3):
+            train(model, i)
+        model._last_obs = np.linspace(-1, 1, 3, dtype=np.float32)[None]
+        actions = model._sample_action(0)[0]
+        assert np.allclose(actions, model.predict(model._last_obs)[0], atol=1e-6)
+        calls.append(list(CALLS))
+        finals.append(states(model) | {"actions": th.tensor(actions, dtype=th.float64)})
+    assert calls[0] == calls[1]
+    assert (CALLED[change] in calls[0]) if change in CALLED else not calls[0]
+    assert_close(*finals, rtol=1e-3, atol=1e-4)
+
+
+def test_the_target_of_a_replaced_part_moves(tmp_path):
+    for fused in (None, False):
+        model = make_model(fused=fused, tau=0.5)
+        train(model, 1)
+        replace_a_layer(model)
+        _, index = last_layer_of_actor(model)
+        start = model.actor_target.mu[index].weight.clone()
+        train(model, 2, n=2)
+        expected = (start + model.actor.mu[index].weight) / 2
+        th.testing.assert_close(model.actor_target.mu[index].weight, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("register", [register_module_forward_hook, register_optimizer_step_pre_hook])
+def test_global_hooks_are_called(register):
+    model = make_model()
+    train(model, 1)
+    handle = register(lambda *_: CALLS.append("global"))
+    try:
+        train(model, 2)
+        assert len(CALLS) > 6
+        assert model._fused_update is None
+    finally:
+        handle.remove()
+    train(model, 3)
+    assert model._fused_update is not None  # and it comes back
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        (nn.Linear, "forward"),
+        (TanhGaussian, "log_prob_from_params"),
+        (th.optim.Adam, "step"),
+        (TDC, "_sample_target_actions"),
+        (TDC, "predict"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else x.__name__,
+)
+def test_a_method_replaced_on_a_class_is_called(place, name, monkeypatch):
+    model = make_model(stochastic_actor=True)
+    train(model, 1)
+    assert model._fused_update is not None
+    own = getattr(place, name)
+
+    def replacement(*args, **kwargs):
+        CALLS.append(name)
+        return own(*args, **kwargs)
+
+    monkeypatch.setattr(place, name, replacement)
+    train(model, 2)
+    model._last_obs = np.zeros((1, 3), np.float32)
+    model._sample_action(0)
+    assert name in CALLS
+
+
+def test_a_replaced_distribution_is_used():
+    class Narrow(TanhGaussian):
+        def actions_from_params(self, mean, log_std, deterministic=False):
+            CALLS.append("narrow")
+            return super().actions_from_params(mean, log_std - 3, deterministic)
+
+    model = make_model(stochastic_actor=True)
+    train(model, 1)
+    model.actor_target.action_dist = Narrow(ACT)
+    train(model, 2)
+    assert CALLS.count("narrow") == 6
+
+
+@HEADS
+@pytest.mark.parametrize("fused", [True, False])
+def test_gradients_are_there_after_an_update(stochastic_actor, fused):
+    """Those of the last update: with β₁ = 0 Adam's first moment is the gradient itself."""
+    kwargs = {"policy_kwargs": {"optimizer_kwargs": {"betas": (0.0, 0.9)}}}
+    model = make_model(stochastic_actor=stochastic_actor, fused=fused, **kwargs)
+    for seed in (1, 2):
+        train(model, seed)
+        for network in (model.actor, model.critic):
+            for parameter in network.parameters():
+                moment = network.optimizer.state[parameter]["exp_avg"]
+                th.testing.assert_close(parameter.grad, moment, rtol=1e-5, atol=1e-8)
+            network.optimizer.zero_grad()
+
+
+class Minibatch(NamedTuple):
+    rewards: th.Tensor
+    dones: th.Tensor
+    next_observations: th.Tensor
+    observations: th.Tensor
+    actions: th.Tensor
+    discounts: None = None
+    weights: float = 1.0
+
+
+def test_a_minibatch_is_read_by_name():
+    class Queue(BatchQueue):
+        def sample(self, batch_size, env=None):
+            observations, actions, next_observations, dones, rewards = next(self.batches)
+            return Minibatch(rewards, dones, next_observations, observations, actions)
+
+    models = [make_model(fused=fused) for fused in (True, False)]
+    for model in models:
+        model.replay_buffer = Queue(random_batches(10, batch=16))
+        th.manual_seed(1)
+        model.train(10, 16)
+    assert_close(*map(states, models), rtol=1e-3, atol=2e-5)
+
+
+# ---------------------------------------------------------------- storage
+
+
+def plain_buffer(n=40):
+    env = TwoActions()
+    buffer = ReplayBuffer(n, env.observation_space, env.action_space, "cpu")
+    rng = np.random.default_rng(0)
+    for _ in range(n // 2):
+        buffer.add(rng.normal(size=3), rng.normal(size=3), rng.normal(size=2), rng.normal(size=1), np.zeros(1), [{}])
+    return buffer
+
+
+def test_a_replay_buffer_in_a_file_or_in_shared_memory_stays_there(tmp_path):
+    in_file, shared, view = plain_buffer(), plain_buffer(), plain_buffer()
+    file = np.memmap(tmp_path / "observations", np.float32, "w+", shape=in_file.observations.shape)
+    file[:] = in_file.observations
+    in_file.observations = file
+    memory = shared_memory.SharedMemory(create=True, size=shared.rewards.nbytes)
+    try:
+        shared.rewards = np.ndarray(shared.rewards.shape, np.float32, buffer=memory.buf)
+        view.dones = np.zeros((80, 1), np.float32)[:40]
+        for buffer, name in ((in_file, "observations"), (shared, "rewards"), (view, "dones")):
+            array, model = getattr(buffer, name), make(TwoActions(), fused=True)
+            model.replay_buffer = buffer
+            model.train(gradient_steps=2, batch_size=8)
+            assert getattr(buffer, name) is array
+        del shared.rewards, array
+    finally:
+        memory.close()
+        memory.unlink()
+
+
+def test_two_models_share_the_rows_of_one_buffer():
+    models = [make(TwoActions(), fused=True, seed=seed) for seed in (1, 2)]
+    buffer = plain_buffer()
+    for model in models:
+        model.replay_buffer = buffer
+    models[0].train(gradient_steps=1, batch_size=8)
+    observations = buffer.observations
+    for model in models * 2:
+        model.train(gradient_steps=1, batch_size=8)
+        assert buffer.observations is observations  # packed once
+    assert models[0]._fused_update.packed_replay is models[1]._fused_update.packed_replay
+    assert PackedReplay.of(buffer).holds(buffer)
+
+
+def test_a_sample_replaced_on_the_class_is_called(monkeypatch):
+    model = make(TwoActions(), fused=True)
+    model.replay_buffer = plain_buffer()
+    model.train(2, 8)
+    own = ReplayBuffer._get_samples
+    monkeypatch.setattr(ReplayBuffer, "_get_samples", lambda *a, **k: CALLS.append("samples") or own(*a, **k))
+    model.train(2, 8)
+    assert CALLS == ["samples"] * 2
+
+
+def test_a_policy_in_shared_memory_stays_there():
+    """Also when it is moved there in mid-run: another process sees every update."""
+    for before in (True, False):
+        model = make_model(fused=True)
+        if before:
+            train(model, 1)
+        model.policy.share_memory()
+        pointers = [p.data_ptr() for p in model.policy.parameters()]
+        value = next(model.critic.parameters()).clone()
+        train(model, 2)
+        assert all(p.is_shared() for p in model.policy.parameters())
+        assert pointers == [p.data_ptr() for p in model.policy.parameters()]
+        assert not th.equal(value, next(model.critic.parameters()))
+
+
+@HEADS
+def test_a_fused_policy_is_pickled_as_small_as_any(stochastic_actor):
+    readable, fused = (make_model(stochastic_actor=stochastic_actor, fused=fused) for fused in (False, True))
+    train(readable, 1)
+    train(fused, 1)
+    sizes = [len(pickle.dumps(model.policy)) for model in (readable, fused)]
+    assert sizes[1] < 1.05 * sizes[0]
+    assert len(pickle.dumps(fused.actor)) < sizes[1]
+    again = pickle.loads(pickle.dumps(fused.policy))
+    observation = np.array([0.1, 0.2, 0.3], np.float32)
+    assert np.array_equal(again.predict(observation)[0], fused.predict(observation)[0])
+
+
+@HEADS
+def test_a_copied_model_learns_on_its_own(stochastic_actor):
+    model = make_model(stochastic_actor=stochastic_actor, fused=True)
+    train(model, 1)
+    reference = make_model(stochastic_actor=stochastic_actor, fused=True)
+    train(reference, 1)
+    model.replay_buffer = None  # that of the test cannot be copied
+    copied = copy.deepcopy(model)
+    before = states(model)
+    train(copied, 2)
+    assert_close(before, states(model), rtol=0, atol=0)
+    train(reference, 2)
+    assert_close(states(reference), states(copied), rtol=0, atol=0)
+
+
+# ---------------------------------------------------------------- settings read in mid-run
+
+
+@pytest.mark.parametrize("fused", [None, False])
+def test_sb3s_learning_rate_schedule_is_read(fused):
+    """And a learning rate put in its place later."""
+    model = make(TwoActions(), fused=fused, learning_starts=10).learn(20)
+    before = states(model)
+    model.lr_schedule = lambda progress: 0.0
+    model.learn(20, reset_num_timesteps=False)
+    moved = [k for k, v in states(model).items() if k.startswith("policy.actor.") and not th.equal(v, before[k])]
+    assert not moved
+    model.learning_rate = 2e-3
+    model.train(1, 8)
+    assert model.actor.optimizer.param_groups[0]["lr"] == 2e-3
+
+
+@pytest.mark.parametrize("fused", [None, False])
+def test_a_target_entropy_changed_in_mid_run_is_read(fused):
+    slopes = []
+    for target in (-100.0, 100.0):  # the slope of log α is −mean(log π + H), on the same samples
+        model = make_model(stochastic_actor=True, fused=fused)
+        train(model, 1)
+        model.target_entropy = target
+        train(model, 2, n=2)
+        slopes.append(model.log_ent_coef.grad.item())
+    assert slopes[0] - slopes[1] == pytest.approx(200)
+    model.target_entropy = "high"
+    with pytest.raises(ValueError, match="target_entropy"):
+        train(model, 3)
+
+
+def test_the_reason_for_the_readable_update_is_said_once(capsys):
+    model = make_model(verbose=1)
+    train(model, 1)
+    capsys.readouterr()
+    replace_forward(model)
+    for seed in (2, 3, 4):
+        train(model, seed)
+    output = capsys.readouterr().out
+    assert output.count("Using the readable update (forward of a module of the actor is replaced)") == 1
+
+
+def test_integer_observations_are_acted_on_as_predict_does():
+    class Integers(TwoActions):
+        observation_space = gym.spaces.Box(-9, 9, (3,), np.int64)
+
+        def reset(self, **kwargs):
+            super().reset(**kwargs)
+            return np.array([1, -2, 3]), {}
+
+        def step(self, action):
+            _, *rest = super().step(action)
+            return np.array([2, 0, -5]), *rest
+
+    model = make(Integers(), fused=True, action_noise=None, learning_starts=10).learn(30)
+    expected = model.predict(model._last_obs)[0]
+    np.testing.assert_allclose(model._sample_action(0)[0], expected, rtol=1e-5, atol=1e-6)
