@@ -35,11 +35,12 @@ PARTS = {  # name → its place in the model, the method
 }
 
 
-def measure(env_id: str, steps: int) -> dict[str, float]:
+def measure(env_id: str, steps: int, stochastic_actor: bool) -> dict[str, float]:
     """Return microseconds per training step, by part."""
     from sb3_tdc import TDC
 
-    model = TDC("MlpPolicy", env_id, learning_starts=300, buffer_size=200_000, device="cpu", seed=0).learn(1000)
+    settings: dict[str, Any] = {"learning_starts": 300, "buffer_size": 200_000, "device": "cpu", "seed": 0}
+    model = TDC("MlpPolicy", env_id, stochastic_actor=stochastic_actor, **settings).learn(1000)
     update: Any = model._fused_update
     actor_part = "_update_stochastic_actor" if model.stochastic_actor else "_update_deterministic_actor"
     times: dict[str, list[float]] = defaultdict(list)
@@ -74,6 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default=ENVS[0])
     parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--stochastic", action="store_true", help="the tanh-Gaussian head")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -81,13 +83,14 @@ def main() -> None:
         import torch as th
 
         th.set_num_threads(arguments.threads[0])
-        print(*measure(arguments.env, arguments.steps).values())
+        print(*measure(arguments.env, arguments.steps, arguments.stochastic).values())
         return
     columns = []
     for threads in arguments.threads:
         environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
         command = [sys.executable, "-W", "ignore", "-m", "benchmarks.parts", "--child", "--threads", str(threads)]
         command += ["--env", arguments.env, "--steps", str(arguments.steps)]
+        command += ["--stochastic"] if arguments.stochastic else []
         output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
         columns.append(np.array(output.splitlines()[-1].split(), dtype=float))
     print(f"{arguments.env}, {hardware()}, microseconds per training step.\n")
