@@ -1,7 +1,6 @@
 """Ctrl-C and a polite kill: training ends after the step under way, with everything consistent."""
 
 import signal
-import sys
 import threading
 import time
 import warnings
@@ -12,15 +11,17 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.checkpoint import Checkpoints
+from sb3_tdc.output import write_from_handler
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# SIGHUP: the terminal was closed (Windows has none)
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 # How long a rollout may take to its end, where a checkpoint can be written
 _PATIENCE_SECONDS = 5.0
 
 
 class StopOnSignal(BaseCallback):
     """
-    As a context, it takes SIGINT and SIGTERM; as a callback, it ends training after one. A second one interrupts.
+    As a context, it takes SIGINT, SIGTERM and SIGHUP; as a callback, it ends training after one. A second interrupts.
 
     An exception raised by a handler, anywhere, could leave a step of processes half received or a file half written.
 
@@ -39,7 +40,8 @@ class StopOnSignal(BaseCallback):
 
     def __enter__(self) -> "StopOnSignal":
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
-            self.previous = {number: signal.signal(number, self._handle) for number in _SIGNALS}
+            taken = [number for number in _SIGNALS if not _is_ignored_hangup(number)]
+            self.previous = {number: signal.signal(number, self._handle) for number in taken}
         else:
             self.previous = {}
         return self
@@ -55,7 +57,7 @@ class StopOnSignal(BaseCallback):
             raise KeyboardInterrupt
         self.requested = True
         self.deadline = time.monotonic() + _PATIENCE_SECONDS
-        print("\nStopping after this step; once more to stop without saving.", file=sys.stderr, flush=True)
+        write_from_handler("\nStopping after this step; once more to stop without saving.\n")
 
     def _on_rollout_start(self) -> None:
         if self.requested and self.checkpoints is not None and self.checkpoints.last_step == self.model.num_timesteps:
@@ -63,6 +65,11 @@ class StopOnSignal(BaseCallback):
 
     def _on_step(self) -> bool:
         return not self.requested or (self.checkpoints is not None and time.monotonic() < self.deadline)
+
+
+def _is_ignored_hangup(number: signal.Signals) -> bool:
+    """Return whether it is the SIGHUP of a process started with ``nohup``."""
+    return number.name == "SIGHUP" and signal.getsignal(number) == signal.SIG_IGN
 
 
 class StoppableEvaluation(EvalCallback):

@@ -18,6 +18,7 @@ from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_com
 from sb3_tdc.checkpoint import DEFAULT_FREQ, NotRestoredError
 from sb3_tdc.experiment import ALGORITHMS, Experiment, Outcome, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
+from sb3_tdc.output import harmless_output
 from sb3_tdc.run_folder import RunFolder
 from sb3_tdc.tdc import NonFiniteError
 
@@ -181,9 +182,16 @@ def _command_to_go_on(argv: Sequence[str] | None, n_timesteps: int, model: Path)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
+    Train, or resume a run.
+
     :param argv: arguments, those of the process by default
     :return: 0, 1 if training diverged, 130 if the user stopped it
     """
+    with harmless_output():
+        return _main(argv)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     parser = make_parser()
     args, given = parser.parse_args(argv), parser.parse_given(argv)
     start = time.monotonic()

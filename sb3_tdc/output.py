@@ -1,0 +1,63 @@
+"""What a run prints never ends it: not at a closed pipe or terminal, on a full disk, or where a letter is missing."""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+
+class _HarmlessStream:
+    """
+    A text stream that drops what cannot be written, and replaces letters that it cannot encode.
+
+    :param stream: standard output or standard error
+    """
+
+    def __init__(self, stream: Any):
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        try:
+            self._stream.write(text)
+        except UnicodeEncodeError:
+            encoding = self._stream.encoding
+            self.write(text.encode(encoding, errors="replace").decode(encoding))
+        except (OSError, ValueError):  # a ValueError if it was closed
+            pass
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def harmless_output() -> Iterator[None]:
+    """Let nothing that is printed in this block raise, and nothing that is left of it at the exit of the process."""
+    streams = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (stream and _HarmlessStream(stream) for stream in streams)  # None if closed from the start
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = streams
+        for stream in streams:
+            _drop_what_cannot_be_flushed(stream)
+
+
+def _drop_what_cannot_be_flushed(stream: Any) -> None:
+    try:
+        if stream is not None:
+            stream.flush()
+    except (OSError, ValueError):
+        with suppress(OSError, ValueError):  # Python flushes once more when it exits, and would fail then
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def write_from_handler(text: str) -> None:
+    """Write to standard error from the handler of a signal, which may have interrupted a write there."""
+    with suppress(OSError):
+        os.write(2, text.encode("ascii", errors="replace"))
