@@ -154,8 +154,8 @@ class Job:
 
 
 def eval_freq(n_timesteps: int) -> int:
-    """:return: steps between evaluations: the paper's 20,000, and in a short run a twentieth of it"""
-    return min(20_000, max(n_timesteps // 20, 1))
+    """:return: steps between evaluations: the paper's 20,000, and in a short run a thirtieth of it"""
+    return min(20_000, max(n_timesteps // 30, 1))
 
 
 def stop(processes: Sequence[subprocess.Popen]) -> None:

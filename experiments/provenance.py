@@ -2,22 +2,20 @@
 
 import os
 import platform
-import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Sequence
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import gymnasium as gym
 import pandas as pd
 
 from experiments.results import Group, Run, describe, differences
-from experiments.suites import SUITES, Cell
+from experiments.suites import PAPER, Cell
 from experiments.tables import number
 from sb3_tdc.experiment import ALGORITHMS
+from sb3_tdc.versions import commit_of_the_code, processor_name
 
 _PACKAGES = ("sb3-tdc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy", "scipy")
 _TITLES = {
@@ -33,7 +31,7 @@ def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
     """:return: titles and tables: the seeds of every experiment of the paper, and why the absent ones are absent"""
     found = []
     absent: dict[str, dict[str, list[str]]] = {}
-    for suite, cells in SUITES.items():
+    for suite, cells in PAPER.items():
         table = pd.DataFrame(
             "",
             index=list(dict.fromkeys(cell.env_id for cell in cells)),
@@ -119,10 +117,6 @@ def describe_runs(runs: Sequence[Run]) -> pd.DataFrame:
 
 def describe_machine() -> dict[str, str]:
     """Of the machine and the code that made the report."""
-    cpu = platform.processor()
-    if Path("/proc/cpuinfo").is_file():
-        found = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-        cpu = found[1] if found else cpu
     versions = []
     for package in _PACKAGES:
         try:
@@ -132,21 +126,7 @@ def describe_machine() -> dict[str, str]:
     return {
         "Made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         "Command": shlex.join(sys.orig_argv),
-        "Commit of the code that made it": _commit() or "not in a git repository",
-        "Machine that made it": f"{cpu}, {os.cpu_count()} cores, {platform.platform()}",
+        "Commit of the code that made it": commit_of_the_code() or "not in a git repository",
+        "Machine that made it": f"{processor_name()}, {os.cpu_count()} cores, {platform.platform()}",
         "Versions there": ", ".join([f"Python {platform.python_version()}", *versions]),
     }
-
-
-def _commit() -> str:
-    here = Path(__file__).parent
-    try:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True
-        ).stdout.strip()
-        changes = subprocess.run(
-            ["git", "status", "--porcelain"], cwd=here, capture_output=True, text=True, check=True
-        ).stdout
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return f"{commit}, with uncommitted changes" if changes.strip() else commit

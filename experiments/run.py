@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments.jobs import Job, cluster, count_cores, run
 from experiments.results import default_settings, find_runs, same_settings
-from experiments.suites import ISAAC, PACKAGES, SUITES, Cell
+from experiments.suites import ISAAC, PACKAGES, PAPER, SUITES, Cell
 from sb3_tdc import train
 from sb3_tdc.arguments import Parser, one_of
 from sb3_tdc.experiment import ALGORITHMS
@@ -60,8 +60,8 @@ def make_plan(cells: Sequence[Cell], seeds: Sequence[int], scale: float, logs: P
     """
     Seed by seed, so that a matrix that is stopped early has something of every cell.
 
-    :param scale: the fraction of the paper's steps
-    :param logs: of all runs; those of a scale have a folder of their own
+    :param scale: the fraction of the suite's steps
+    :param logs: of all runs; those of a scale, or of a number of steps, have a folder of their own
     """
     missing = {f"{cell.algo} on {cell.env_id}": _why_missing(cell) for cell in cells}
     possible = [cell for cell in cells if not missing[f"{cell.algo} on {cell.env_id}"]]
@@ -78,12 +78,14 @@ def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
     implied = {**default_settings(cell.algo), **entry}
     settings = {key: value for key, value in cell.settings.items() if not same_settings(implied.get(key), value)}
     variant = ",".join(f"{key}={value}" for key, value in settings.items())
+    n_timesteps = max(round(scale * (cell.n_timesteps or entry["n_timesteps"])), 1)
+    length = f"steps_{n_timesteps}" if cell.n_timesteps else f"scale_{scale:g}"
     return Job(
         cell.algo,
         cell.env_id,
         seed,
-        n_timesteps=max(round(scale * entry["n_timesteps"]), 1),
-        logs=logs.resolve() / f"scale_{scale:g}" / variant / f"seed_{seed}",
+        n_timesteps=n_timesteps,
+        logs=logs.resolve() / length / variant / f"seed_{seed}",
         settings=settings,
         packages=(PACKAGES[cell.env_id],) if cell.env_id in PACKAGES else (),
     )
@@ -238,9 +240,9 @@ def make_parser() -> Parser:
     """:return: of the command line"""
     parser = Parser("Train the runs of one of the paper's figures; finished ones are skipped, stopped ones go on.")
     add = parser.add_argument
-    add("suite", type=one_of("suite", [*SUITES, "all"]), help=f"{', '.join(SUITES)} or all")
+    add("suite", type=one_of("suite", [*SUITES, "all"]), help=f"{', '.join(SUITES)}, or all of the paper's")
     add("--seeds", type=int, nargs="+", default=[5], help="how many (one number), or which (several)")
-    add("--scale", type=float, default=1.0, help="fraction of the paper's steps")
+    add("--scale", type=float, default=1.0, help="fraction of the suite's steps")
     add("--only", nargs="+", default=[], metavar="NAME", help="algorithms and environments")
     add("--logs", type=Path, default=Path("logs"), help="folder of all runs")
     add("--jobs", type=int, help="runs at once (default: one a core)")
@@ -258,7 +260,7 @@ def _plan(args: argparse.Namespace) -> Plan:
     if min(args.seeds) < (1 if len(args.seeds) == 1 else 0):
         raise ValueError(f"--seeds must be how many (at least 1), or which (0 or more), got {min(args.seeds)}")
     seeds = range(1, args.seeds[0] + 1) if len(args.seeds) == 1 else list(dict.fromkeys(args.seeds))
-    cells = [cell for suite in (SUITES if args.suite == "all" else [args.suite]) for cell in SUITES[suite]]
+    cells = [cell for suite in (PAPER if args.suite == "all" else [args.suite]) for cell in SUITES[suite]]
     return make_plan(select(cells, args.only), seeds, args.scale, args.logs)
 
 
@@ -267,7 +269,7 @@ def _describe(args: argparse.Namespace, plan: Plan) -> None:
         print(f"missing {sentence}")
     if plan.jobs and args.scale < 1:
         print(
-            f"At {args.scale:g} of the paper's steps, so are the evaluations (every twentieth of a run, at most 20,000 "
+            f"At {args.scale:g} of the paper's steps, so are the evaluations (every thirtieth of a run, at most 20,000 "
             "steps); random steps at the start: as in the paper, but at most a tenth of a run."
         )
 

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from sb3_tdc.hyperparams import suggest
+from sb3_tdc.versions import commit_of_the_code, library_versions, processor_name
 
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
 
@@ -136,11 +137,13 @@ class RunFolder:
         return self.path / "replay_buffer.pkl"
 
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
-        """Keep what the run was made from: hyperparameters, arguments, and the command."""
+        """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""
         folder = self.path / self.env_name
         _write_text(folder / "command.txt", shlex.join(sys.orig_argv) + "\n")
         _write_text(folder / "config.yml", yaml.safe_dump(config))
         _write_text(folder / "args.yml", yaml.safe_dump(args))
+        about = {**library_versions(), "sb3_tdc": commit_of_the_code() or "a wheel", "processor": processor_name()}
+        _write_text(folder / "versions.yml", yaml.safe_dump(about))
 
 
 def save(save_as: Callable[[Path], Any], path: Path) -> None:

@@ -6,10 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import mujoco
 import numpy as np
-import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
@@ -19,7 +16,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_tdc.checkpoint.codec import Capture, Restore
 from sb3_tdc.checkpoint.replay import other_attributes
-from sb3_tdc.tdc.compiled import numba_version
+from sb3_tdc.versions import library_versions
 
 # Of the process, of the call of learn(), or captured on their own
 _NOT_THE_RUN = {"env", "policy", "replay_buffer", "tensorboard_log", "verbose", "start_time", "_total_timesteps"}
@@ -187,13 +184,7 @@ def describe_run(model: OffPolicyAlgorithm) -> dict[str, Any]:
 def describe_platform(model: OffPolicyAlgorithm) -> dict[str, str]:
     """:return: what the last bits of a result depend on"""
     return {
-        "python": platform.python_version(),
-        "torch": th.__version__,
-        "numpy": np.__version__,
-        "stable_baselines3": stable_baselines3.__version__,
-        "gymnasium": gym.__version__,
-        "mujoco": mujoco.__version__,
-        "numba": numba_version() or "absent",
+        **library_versions(),
         "threads of torch": str(th.get_num_threads()),
         "device": str(model.device),
         "processor": f"{platform.machine()}, {th.backends.cpu.get_cpu_capability()}",

@@ -60,15 +60,30 @@ def test_other_simulators_are_missing_with_a_hint():
 
 
 def test_scaled():
-    # HalfCheetah: 0.02 × 1,500,000 steps; 25,000 random steps are more than a tenth; evaluations at 1/20
+    # HalfCheetah: 0.02 × 1,500,000 steps; 25,000 random steps are more than a tenth; evaluations at 1/30
     def cheetah(scale):
         (job,) = plan("fig1", scale=scale, only=["tdc", "HalfCheetah-v4"]).jobs
         return job
 
     assert (cheetah(0.02).n_timesteps, cheetah(0.02).config["learning_starts"]) == (30_000, 3000)
     assert (cheetah(1).n_timesteps, cheetah(1).config["learning_starts"]) == (1_500_000, 25_000)
-    assert (eval_freq(30_000), eval_freq(1_500_000), eval_freq(7)) == (1500, 20_000, 1)
+    assert (eval_freq(30_000), eval_freq(1_500_000), eval_freq(7)) == (1000, 20_000, 1)
     assert "-params" not in cheetah(1).arguments  # nothing differs from hyperparams/
+
+
+def test_a_suite_of_a_length_of_its_own():
+    jobs = plan("evidence", scale=1).jobs
+    assert [(job.algo, job.env_id, job.settings) for job in jobs[:4]] == [
+        ("tdc", "Hopper-v4", {}),
+        ("td3", "Hopper-v4", {}),
+        ("sac", "Hopper-v4", {}),
+        ("tdc", "Hopper-v4", {"lam": 0.0}),
+    ]
+    assert len(jobs) == 12
+    assert {job.n_timesteps for job in jobs} == {300_000}
+    assert eval_freq(300_000) == 10_000
+    assert jobs[0].logs == Path("/logs/steps_300000/seed_1")
+    assert {job.n_timesteps for job in plan("evidence", scale=0.01).jobs} == {3000}
 
 
 def test_selected():
@@ -98,10 +113,10 @@ def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
     job = Job("tdc", "Pendulum-v1", 1, 100, tmp_path, {"lam": 0.5})
     assert job.run_folder is None
     folder = RunFolder.create(tmp_path, "tdc", "Pendulum-v1")
-    folder.write_config({**job.config, "lam": 0.7}, {"seed": 1, "eval_freq": 5})
+    folder.write_config({**job.config, "lam": 0.7}, {"seed": 1, "eval_freq": 3})
     with pytest.raises(ValueError, match=r"another run \(lam 0.7 instead of 0.5\)"):
         _ = job.run_folder
-    folder.write_config(job.config, {"seed": 1, "eval_freq": 5})
+    folder.write_config(job.config, {"seed": 1, "eval_freq": 3})
     assert (job.run_folder.path, job.steps_done) == (folder.path, 0)
     (folder.checkpoint_folder / "step_000000000040").mkdir(parents=True)
     assert (job.steps_done, job.is_finished) == (40, False)
