@@ -302,7 +302,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if outcome.stopped:
         print("To go on: the same command", file=sys.stderr)
         return 130
-    print(f"To look at them: python -m experiments.report {args.logs / f'scale_{args.scale:g}'}")
+    for folder in dict.fromkeys(args.logs / job.logs.relative_to(args.logs.resolve()).parts[0] for job in plan.jobs):
+        print(f"To look at them: python -m experiments.report {folder}")
     return int(bool(outcome.failed))
 
 

@@ -18,7 +18,7 @@ def library_versions() -> dict[str, str]:
     """Return the versions of everything that computes."""
     return {
         "python": platform.python_version(),
-        "torch": th.__version__,
+        "torch": str(th.__version__),  # a class of its own otherwise
         "numpy": np.__version__,
         "stable_baselines3": stable_baselines3.__version__,
         "gymnasium": gym.__version__,

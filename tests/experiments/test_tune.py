@@ -55,9 +55,9 @@ def make_candidate(folder, lam, returns):
     """:param returns: of each seed, the mean of every evaluation"""
     jobs = []
     for seed, values in enumerate(returns, start=1):
-        job = Job("tdc", "Hopper-v4", seed, 1000, folder / f"{lam}" / f"{seed}", {"lam": lam})
+        job = Job("tdc", "Hopper-v4", seed, 1500, folder / f"{lam}" / f"{seed}", {"lam": lam})
         run = RunFolder.create(job.logs, "tdc", "Hopper-v4")
-        run.write_config(job.config, {"algo": "tdc", "env": "Hopper-v4", "seed": seed, "eval_freq": 33})
+        run.write_config(job.config, {"algo": "tdc", "env": "Hopper-v4", "seed": seed, "eval_freq": 50})
         episodes = np.array(values)[:, None] + [-1, 1]
         np.savez(run.path / "evaluations.npz", timesteps=50 * np.arange(1, len(values) + 1), results=episodes)
         jobs.append(job)
