@@ -38,6 +38,7 @@ from stable_baselines3.common.vec_env import (
 from sb3_tdc.busy_machine import BusyMachine
 from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable
 from sb3_tdc.critic_evaluation import CriticEvaluation
+from sb3_tdc.finite_guard import FiniteGuard, check_weights, divergence_named
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.interruption import StopOnSignal, ignore_interrupts
 from sb3_tdc.progress import ProgressCallback
@@ -60,6 +61,8 @@ class Experiment:
     :param save_freq: environment steps between saved models; 0 or less: none
     :param checkpoint_freq: environment steps between checkpoints to resume from; 0 or less: none
     :param resume: go on from the newest checkpoint in the folder
+    :param from_step: go on from the checkpoint of this step instead
+    :param changed: hyperparameters that are others from there on
     :param tensorboard_log: "" for none; None for the run's own folder
     :param trained_model: a zip to go on from; its replay buffer and normalisation are loaded if they lie beside it
     :param trust: whether ``trained_model`` and what lies beside it may run code, as SB3's ``load`` lets them
@@ -78,6 +81,8 @@ class Experiment:
     save_replay_buffer: bool = False
     checkpoint_freq: int = DEFAULT_FREQ
     resume: bool = False
+    from_step: int | None = None
+    changed: tuple[str, ...] = ()
     vec_env: str = "dummy"
     device: str = "auto"
     env_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -207,7 +212,9 @@ def train(experiment: Experiment) -> Outcome:
             callbacks = [*_make_callbacks(experiment, eval_env, progress, stop), progress, stop]
             if checkpoints is not None:
                 callbacks.insert(0, checkpoints)
-                checkpoints.restore(model)
+                _choose_checkpoint(experiment, checkpoints, model)
+            if not isinstance(model, TDC):
+                callbacks.insert(0, FiniteGuard())
             callbacks.insert(0, BusyMachine(progress.say, _remedy(experiment)))
         except BaseException as error:
             stack.close()
@@ -217,7 +224,7 @@ def train(experiment: Experiment) -> Outcome:
                 raise
             raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
         stack.callback(progress.close)
-        with stop:
+        with stop, divergence_named(model):
             model.learn(
                 experiment.hyperparams.n_timesteps,
                 callback=callbacks,
@@ -253,6 +260,16 @@ def _open_checkpoints(experiment: Experiment) -> Checkpoints | None:
         for events in folder.path.glob("events.out.tfevents.*"):
             events.unlink()
     return checkpoints
+
+
+def _choose_checkpoint(experiment: Experiment, checkpoints: Checkpoints, model: OffPolicyAlgorithm) -> None:
+    """Choose the checkpoint to go on from, and record hyperparameters that are changed from there on."""
+    folder = experiment.folder
+    # Whatever has ever been changed is as in config.yml: the checkpoint may be older than the change
+    earlier = [name for change in folder.changes for name in change["hyperparams"]]
+    step = checkpoints.restore(model, experiment.from_step, [*earlier, *experiment.changed])
+    if experiment.changed:
+        folder.record_change(step or 0, experiment.hyperparams.raw, experiment.changed)
 
 
 def _make_training_envs(experiment: Experiment) -> VecEnv:
@@ -409,6 +426,7 @@ def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
 
 
 def _save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
+    check_weights(model, path)
     save(model.save, path)
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
@@ -448,6 +466,8 @@ class _SavePeriodically(CheckpointCallback):
     """The same for the models of ``--save-freq``."""
 
     def _on_step(self) -> bool:
+        if self.n_calls % self.save_freq == 0:
+            check_weights(self.model, Path(self._checkpoint_path(extension="zip")))
         try:
             return super()._on_step()
         except _DISK_ERRORS as error:

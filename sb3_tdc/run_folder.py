@@ -136,6 +136,26 @@ class RunFolder:
             return self.path / "best_model_replay_buffer.pkl"  # none is saved
         return self.path / "replay_buffer.pkl"
 
+    @property
+    def changes(self) -> list[dict[str, Any]]:
+        """What ``-params`` changed when the run was resumed: the step, and the hyperparameters from there on."""
+        path = self._changes
+        return _read_yaml(path)["changes"] if path.is_file() else []
+
+    @property
+    def _changes(self) -> Path:
+        return self.path / self.env_name / "changes.yml"
+
+    def record_change(self, step: int, config: dict[str, Any], names: tuple[str, ...]) -> None:
+        """
+        Keep that hyperparameters are others from a step on.
+
+        :param config: all of them, as they are now
+        """
+        change = {"step": step, "hyperparams": {name: config[name] for name in names}}
+        _write_text(self._changes, yaml.safe_dump({"changes": [*self.changes, change]}))
+        _write_text(self.path / self.env_name / "config.yml", yaml.safe_dump(config))
+
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
         """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""
         folder = self.path / self.env_name

@@ -15,7 +15,7 @@ import yaml
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments, plain_arguments
-from sb3_tdc.checkpoint import DEFAULT_FREQ, NotRestoredError
+from sb3_tdc.checkpoint import DEFAULT_FREQ, NotRestoredError, stored_steps
 from sb3_tdc.experiment import ALGORITHMS, Experiment, Outcome, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.output import harmless_output
@@ -39,6 +39,7 @@ def make_parser() -> Parser:
     add("--save-freq", type=int, default=-1, help="save the model every so many steps (-1: only at the end)")
     add("--checkpoint-freq", type=int, default=DEFAULT_FREQ, help="steps between checkpoints to resume from (-1: none)")
     add("--resume", type=Path, metavar="RUN_FOLDER", help="go on with a stopped run; it has all other arguments")
+    add("--from", dest="from_step", type=int, metavar="STEP", help="with --resume: go back to the checkpoint of a step")
     add("--save-replay-buffer", action="store_true", help="save the replay buffer with the model")
     add("--log-interval", type=int, default=-1, help="episodes between log entries (-1: 4, 0: no log)")
     add("-tb", "--tensorboard-log", help='TensorBoard folder (none given: the run\'s own; "": off)')
@@ -79,6 +80,8 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
 
     :raises ValueError: for anything that is not allowed
     """
+    if args.from_step is not None:
+        raise ValueError("--from goes with --resume RUN_FOLDER")
     args.env = apply_common_arguments(args, args.env)
     check_env_id(args.env)
     if args.n_timesteps < 1 and args.n_timesteps != -1:
@@ -110,10 +113,11 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
         raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
     stored = folder.args
     for name, value in plain_arguments(given).items():
-        if name not in (*_OF_THE_PROCESS, "resume") and value != stored.get(name, value):
+        if name not in (*_OF_THE_PROCESS, *_OF_RESUMING) and value != stored.get(name, value):
             flag = f"--{name.replace('_', '-')}"
             raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {stored[name]}")
-    resumed = {**stored, **{name: value for name, value in given.items() if name in (*_OF_THE_PROCESS, "resume")}}
+    changed = given.get("hyperparams", {})
+    resumed = {**stored, **{name: value for name, value in given.items() if name in (*_OF_THE_PROCESS, *_OF_RESUMING)}}
     vars(args).update(resumed)
     if folder.is_finished:
         return None
@@ -122,15 +126,21 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
     args.trained_agent = Path(args.trained_agent) if args.trained_agent is not None else None
     apply_common_arguments(args, args.env)
     check_env_id(args.env)
-    where = folder.path / folder.env_name / "config.yml"
-    return _experiment(args, parse(folder.config, ALGORITHMS[args.algo], str(where)), folder)
+    where, config = str(folder.path / folder.env_name / "config.yml"), folder.config
+    differing = {name: value for name, value in changed.items() if name not in config or config[name] != value}
+    parse({"n_timesteps": 1, **differing}, ALGORITHMS[args.algo], "command line (-params)")
+    hyperparams = parse({**config, **differing}, ALGORITHMS[args.algo], where)
+    return _experiment(args, hyperparams, folder, tuple(differing))
 
 
-# What may differ when a run is resumed
+# What may differ when a run is resumed, and what is said only then; hyperparameters may too, and are recorded
 _OF_THE_PROCESS = ("num_threads", "device", "verbose", "progress")
+_OF_RESUMING = ("resume", "from_step", "hyperparams")
 
 
-def _experiment(args: argparse.Namespace, hyperparams: Hyperparams, folder: RunFolder) -> Experiment:
+def _experiment(
+    args: argparse.Namespace, hyperparams: Hyperparams, folder: RunFolder, changed: tuple[str, ...] = ()
+) -> Experiment:
     set_random_seed(args.seed)
     progress_bar = args.progress
     if progress_bar is None:
@@ -148,6 +158,8 @@ def _experiment(args: argparse.Namespace, hyperparams: Hyperparams, folder: RunF
         save_replay_buffer=args.save_replay_buffer,
         checkpoint_freq=args.checkpoint_freq,
         resume=args.resume is not None,
+        from_step=args.from_step,
+        changed=changed,
         vec_env=args.vec_env,
         device=args.device,
         env_kwargs=args.env_kwargs,
@@ -212,6 +224,7 @@ def _main(argv: Sequence[str] | None) -> int:
         parser.fail(error)
     except NonFiniteError as error:
         print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)
+        _say_how_to_go_back(folder)
         return 1
     except KeyboardInterrupt:
         print(f"Stopped without saving; what was saved before stays in {folder.path}", file=sys.stderr)
@@ -225,6 +238,15 @@ def _main(argv: Sequence[str] | None) -> int:
         packages = f" --gym-packages {shlex.join(args.gym_packages)}" if args.gym_packages else ""
         print(f"To watch it: python enjoy.py {folder.path}{packages}")
     return 0
+
+
+def _say_how_to_go_back(folder: RunFolder) -> None:
+    if steps := stored_steps(folder.checkpoint_folder):
+        print(
+            f"To go back to a step before ({', '.join(map(str, steps))}), with other hyperparameters for instance:\n"
+            f"  {folder.command_to_resume} --from {steps[-1]} -params learning_rate:1.0e-4",
+            file=sys.stderr,
+        )
 
 
 def _say_how_to_go_on(

@@ -3,6 +3,14 @@
 from sb3_tdc.checkpoint.callback import DEFAULT_FREQ, Checkpoints
 from sb3_tdc.checkpoint.codec import NotCapturedError, NotRestoredError
 from sb3_tdc.checkpoint.simulators import Restorable
-from sb3_tdc.checkpoint.store import BrokenCheckpointError
+from sb3_tdc.checkpoint.store import BrokenCheckpointError, stored_steps
 
-__all__ = ["DEFAULT_FREQ", "BrokenCheckpointError", "Checkpoints", "NotCapturedError", "NotRestoredError", "Restorable"]
+__all__ = [
+    "DEFAULT_FREQ",
+    "BrokenCheckpointError",
+    "Checkpoints",
+    "NotCapturedError",
+    "NotRestoredError",
+    "Restorable",
+    "stored_steps",
+]

@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,11 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_tdc.checkpoint import replay, state
 from sb3_tdc.checkpoint.codec import NotRestoredError
 from sb3_tdc.checkpoint.store import Store, Stored
+from sb3_tdc.tdc.diagnostics import NonFiniteError
 
 DEFAULT_FREQ = 10_000
+# The older state that is kept is between so many and twice as many times ``freq`` steps older than the newest
+_OLDER = 10
 
 
 class Checkpoints(BaseCallback):
@@ -36,7 +39,8 @@ class Checkpoints(BaseCallback):
 
     :param folder: of the checkpoints; of one run
     :param freq: environment steps between checkpoints, at least
-    :param keep: how many of the newest stay on disk
+    :param keep: how many of the newest stay on disk; besides, an older one stays, to go back to before a divergence,
+        and the one that will take its place
     :param files: files that callbacks rewrite and that belong to the state; those of an ``EvalCallback`` do
     :param verbose: 0: no messages but warnings
     :raises ValueError: if ``freq`` or ``keep`` is below 1, or another process writes to the folder
@@ -57,12 +61,13 @@ class Checkpoints(BaseCallback):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
         self.freq, self.files = freq, [Path(file) for file in files]
-        self.store = Store(Path(folder), keep)
+        self.store = Store(Path(folder), keep, span=_OLDER * freq)
         self.is_wanted: Callable[[], bool] = lambda: False
         self.last_step: int | None = None  # of the newest checkpoint
         self.seconds = 0.0  # that training has waited for checkpoints
         self._to_restore: Stored | None = None
         self._parts: dict[str, Any] = {}
+        self._changed: tuple[str, ...] = ()
         self._segments: list[replay.Segment] = []
         self._digests: dict[str, str] = {}
         self._before: tuple[int, int] | None = None  # position in the replay buffer and timestep of the last segment
@@ -70,15 +75,23 @@ class Checkpoints(BaseCallback):
 
     # ---------------------------------------------------------------- restoring
 
-    def restore(self, model: OffPolicyAlgorithm) -> int | None:
+    def restore(self, model: OffPolicyAlgorithm, step: int | None = None, changed: Sequence[str] = ()) -> int | None:
         """
         Choose the newest intact checkpoint; the next ``model.learn`` goes on from it.
 
         :param model: built as for the first run, with its environments
+        :param step: go back to the checkpoint of this step; those after it are removed when training begins
+        :param changed: attributes of the model that stay as it was built, out of ``state.CHANGEABLE``
         :return: the timestep it will go on from, None if there is no checkpoint yet
-        :raises ValueError: if it is of another algorithm or environment, or if there are some and none is intact
+        :raises ValueError: if it is of another algorithm or environment, if there are some and none is intact, or if
+            there is none of that step
         """
-        stored = self.store.newest()
+        for name in changed:
+            if name not in state.CHANGEABLE:
+                raise ValueError(
+                    f"{name} cannot be changed in a run that goes on; {', '.join(state.CHANGEABLE)} can be"
+                )
+        stored = self.store.newest() if step is None else self.store.at(step)
         if stored is None:
             return None
         parts = json.loads((stored.path / "state.json").read_text())
@@ -86,7 +99,7 @@ class Checkpoints(BaseCallback):
             if parts["run"][name] != now:
                 difference = "is another" if name == "network" else f"was {parts['run'][name]}, and is {now}"
                 raise ValueError(f"{stored.path} is of another run: the {name} {difference}")
-        self._to_restore, self._parts = stored, parts
+        self._to_restore, self._parts, self._changed = stored, parts, tuple(changed)
         return stored.step
 
     def _on_training_start(self) -> None:
@@ -113,7 +126,7 @@ class Checkpoints(BaseCallback):
         state.restore_weights(model, weights)
         with np.load(stored.path / "arrays.npz", allow_pickle=False) as arrays:
             numbered = [arrays[str(i)] for i in range(len(arrays.files))]
-        restarted = state.restore_state(model, self.root, parts["state"], numbered, stored.step)
+        restarted = state.restore_state(model, self.root, parts["state"], numbered, stored.step, self._changed)
         self._put_files_back(stored, parts["files"])
         self.store.remove_after(stored.step)
         self._digests, self.last_step = dict(stored.shared), stored.step
@@ -168,6 +181,7 @@ class Checkpoints(BaseCallback):
 
     def _write(self, step: int) -> None:
         model: Any = self.model
+        _refuse_non_finite(step, state.find_non_finite(model))
         parts, context = state.capture_state(model, self.root)
         segments, digests = self._write_segment(step)
         files = [*self.files, *state.files_of_evaluations(self.root)]
@@ -204,6 +218,7 @@ class Checkpoints(BaseCallback):
         new = replay.new_segment(buffer, f"step_{step:012d}.npz", first, (step - last_step) // model.n_envs)
         if new is None:
             return segments, self._digests
+        _refuse_non_finite(step, replay.find_non_finite(buffer, new))
         digest = self.store.write_shared(new.name, replay.write_segment(buffer, new))
         segments = replay.needed([*segments, new], buffer.buffer_size)
         digests = {**self._digests, new.name: digest}
@@ -238,6 +253,15 @@ class Checkpoints(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+def _refuse_non_finite(step: int, names: list[str]) -> None:
+    if names:
+        more = f" and {len(names) - 3} others" if len(names) > 3 else ""
+        raise NonFiniteError(
+            f"The checkpoint of step {step:,} was not written: {', '.join(names[:3])}{more} are not finite. "
+            "Training has stopped; those before stay."
+        )
 
 
 def _save_weights(weights: dict[str, Any], path: Path) -> None:

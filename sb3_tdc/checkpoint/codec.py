@@ -53,10 +53,11 @@ class Capture:
             return {"same": self._seen[id(value)]}
         for tag, kind in KINDS.items():
             if kind.matches(value):
-                if kind.has_identity:
-                    self._seen[id(value)] = len(self._seen)
-                    self._alive.append(value)
-                return {tag: kind.capture(self, value, path)}
+                if not kind.has_identity:
+                    return {tag: kind.capture(self, value, path)}
+                number = self._seen[id(value)] = len(self._alive)
+                self._alive.append(value)
+                return {tag: kind.capture(self, value, path), "number": number}
         raise NotCapturedError(f"{path} is a {name_of(type(value))}")
 
     def capture_attributes(self, values: dict[str, Any], path: str, optional: bool = False) -> dict[str, Any]:
@@ -92,7 +93,7 @@ class Restore:
     def __init__(self, arrays: list[np.ndarray], known: dict[str, Any] | None = None, step: int = 0):
         self.arrays, self.known, self.step = arrays, known or {}, step
         self.restarted: list[str] = []
-        self._seen: list[Any] = []
+        self._seen: dict[int, Any] = {}
 
     def restore(self, node: Any, existing: Any, path: str) -> Any:
         """
@@ -103,17 +104,18 @@ class Restore:
         """
         if type(node) in _SCALARS:
             return node
-        ((tag, content),) = node.items()
+        tag, content = next(iter(node.items()))
         if tag == "known":
             return self.known[content]
         if tag == "same":
+            if content not in self._seen:
+                raise NotRestoredError(f"{path} was part of what could not be restored")
             return self._seen[content]
-        number = len(self._seen)
-        if KINDS[tag].has_identity:
-            self._seen.append(existing)  # until it is there: an object is, a container that contains itself is not
+        if "number" in node:
+            self._seen[node["number"]] = existing  # until it is there: an object is, a container in itself is not
         value = KINDS[tag].restore(self, content, existing, path)
-        if KINDS[tag].has_identity:
-            self._seen[number] = value
+        if "number" in node:
+            self._seen[node["number"]] = value
         return value
 
     def restore_attributes(self, nodes: dict[str, Any], owner: Any, path: str) -> None:

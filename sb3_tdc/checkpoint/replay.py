@@ -76,6 +76,13 @@ def needed(segments: list[Segment], size: int) -> list[Segment]:
     return kept
 
 
+def find_non_finite(buffer: ReplayBuffer, segment: Segment) -> list[str]:
+    """:return: the names of the rings that hold a NaN or an infinite number among the slots of a segment"""
+    slots = _slots(buffer, segment)
+    floats = {name: ring for name, ring in rings(buffer).items() if ring.dtype.kind == "f"}
+    return [f"replay_buffer.{name}" for name, ring in floats.items() if not np.isfinite(_take(ring, slots)).all()]
+
+
 def write_segment(buffer: ReplayBuffer, segment: Segment) -> Callable[[Path], None]:
     """:return: what writes the file of a segment"""
 

@@ -3,6 +3,7 @@
 import platform
 import random
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_tdc.checkpoint.codec import Capture, Restore
 from sb3_tdc.checkpoint.replay import other_attributes
+from sb3_tdc.tdc.checks import find_non_finite as find_non_finite_weights
 from sb3_tdc.versions import library_versions
 
 # Of the process, of the call of learn(), or captured on their own
@@ -44,17 +47,25 @@ def capture_state(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[di
 
 
 def restore_state(
-    model: OffPolicyAlgorithm, callback: BaseCallback, parts: dict[str, Any], arrays: list[np.ndarray], step: int
+    model: OffPolicyAlgorithm,
+    callback: BaseCallback,
+    parts: dict[str, Any],
+    arrays: list[np.ndarray],
+    step: int,
+    changed: Sequence[str] = (),
 ) -> list[str]:
     """
     Everything but the weights and the rings of the replay buffer, which are there already.
 
+    :param changed: hyperparameters that stay as they are, out of ``CHANGEABLE``
     :return: why episodes have to be started again, if they do
     :raises NotRestoredError: if the model, its environments or its callbacks are others than those captured
     """
     context = Restore(arrays, {"model": model}, step)
-    context.restore_attributes(parts["model"], model, "model")
-    context.restore_attributes(parts["replay_buffer"], _buffer(model), "replay_buffer")
+    kept = {attribute for name in changed for attribute in CHANGEABLE[name]}
+    for owner, path in ((model, "model"), (_buffer(model), "replay_buffer")):
+        nodes = {name: node for name, node in parts[path].items() if name not in kept}
+        context.restore_attributes(nodes, owner, path)
     context.restore(parts["env"], model.env, "env")
     restarted = list(context.restarted)
     context.restore(parts["callbacks"], callback, "callbacks")
@@ -85,6 +96,21 @@ def _buffer(model: OffPolicyAlgorithm) -> Any:
     return model.replay_buffer
 
 
+# ---------------------------------------------------------------- hyperparameters that may change
+
+# The attributes that a hyperparameter is kept in; ``gamma`` also in replay buffers for n steps
+CHANGEABLE: dict[str, tuple[str, ...]] = {
+    "learning_rate": ("learning_rate", "lr_schedule"),
+    **{
+        name: (name,)
+        for name in (
+            *("qf_learning_rate", "gamma", "tau", "lam", "kappa", "batch_size", "gradient_steps", "train_freq"),
+            *("policy_delay", "target_policy_noise", "target_noise_clip", "learning_starts"),
+        )
+    },
+}
+
+
 # ---------------------------------------------------------------- weights
 
 
@@ -107,6 +133,27 @@ def restore_weights(model: OffPolicyAlgorithm, weights: dict[str, Any]) -> None:
             recursive_getattr(model, name).copy_(tensor)
     for distribution, noise in zip(_gsde(model), weights["noise"], strict=True):
         vars(distribution).update(noise)
+
+
+def find_non_finite(model: OffPolicyAlgorithm) -> list[str]:
+    """:return: the names of weights, moments of optimizers and running statistics that are NaN or infinite"""
+    broken = find_non_finite_weights(model.policy, model.policy.state_dict())
+    state_dicts, tensors = model._get_torch_save_params()
+    numbers: dict[str, Any] = {name: recursive_getattr(model, name).detach() for name in tensors}
+    for name in state_dicts:
+        optimizer = recursive_getattr(model, name)
+        if isinstance(optimizer, th.optim.Optimizer):
+            for i, moments in optimizer.state_dict()["state"].items():
+                numbers |= {f"{name}[{i}].{moment}": value for moment, value in moments.items()}
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        statistics = {"ret_rms": normalization.ret_rms, "obs_rms": normalization.obs_rms}
+        if isinstance(normalization.obs_rms, dict):
+            statistics.update({f"obs_rms[{key!r}]": rms for key, rms in normalization.obs_rms.items()})
+        for name, rms in statistics.items():
+            if isinstance(rms, RunningMeanStd):
+                numbers |= {f"VecNormalize.{name}.{part}": th.as_tensor(vars(rms)[part]) for part in ("mean", "var")}
+    return broken + [n for n, value in numbers.items() if isinstance(value, th.Tensor) and not value.isfinite().all()]
 
 
 _GSDE = ("exploration_mat", "exploration_matrices")

@@ -60,11 +60,13 @@ class Store:
 
     :param folder: made if it is missing
     :param keep: how many of the newest stay
+    :param span: besides, one stays that is at least so many steps older than the newest, and less than twice as many
+        as soon as there can be one; 0 for none
     :raises ValueError: if another process writes there
     """
 
-    def __init__(self, folder: Path, keep: int):
-        self.folder, self.keep = folder, keep
+    def __init__(self, folder: Path, keep: int, span: int):
+        self.folder, self.keep, self.span = folder, keep, span
         (folder / _SHARED).mkdir(parents=True, exist_ok=True)
         self._lock = _lock(folder / "lock")
 
@@ -94,6 +96,16 @@ class Store:
         if reasons:
             raise BrokenCheckpointError(f"No checkpoint in {self.folder} is intact: {'; '.join(reasons)}")
         return None
+
+    def at(self, step: int) -> Stored:
+        """
+        :return: the checkpoint of a step
+        :raises ValueError: if there is none, or it is broken
+        """
+        if step not in self.steps():
+            there = ", ".join(f"{known:,}" for known in self.steps()) or "none"
+            raise ValueError(f"{self.folder} has no checkpoint of step {step:,}; there are: {there}")
+        return self._verify(step)
 
     def _read_manifest(self, step: int) -> dict[str, Any]:
         path = self._path(step) / _MANIFEST
@@ -161,16 +173,17 @@ class Store:
         return Stored(step, path, shared)
 
     def remove_after(self, step: int) -> None:
-        """Remove the checkpoints (broken ones) beyond the one that was restored."""
+        """Remove the checkpoints beyond the one that was restored."""
         for later in self.steps():
             if later > step:
                 self._remove(later)
 
     def remove_old(self) -> None:
-        """Keep the newest, and the shared files that they need."""
-        kept, old = self.steps()[: self.keep], self.steps()[self.keep :]
-        for step in old:
-            self._remove(step)
+        """Keep the newest, an older one with the one that will take its place, and the shared files they need."""
+        kept = _kept(self.steps(), self.keep, self.span)
+        for step in self.steps():
+            if step not in kept:
+                self._remove(step)
         for path in self.folder.glob(".step_*"):
             shutil.rmtree(path, ignore_errors=True)
         needed = set()
@@ -197,6 +210,14 @@ class Store:
 
     def _path(self, step: int) -> Path:
         return self.folder / f"step_{step:012d}"
+
+
+def _kept(steps: list[int], keep: int, span: int) -> list[int]:
+    """:param steps: newest first"""
+    older = steps[: keep - 1 : -1]  # oldest first
+    while len(older) > 1 and steps[0] - older[1] >= span:
+        del older[0]
+    return [*steps[:keep], *(older[:2] if span else [])]
 
 
 def _write(path: Path, write: Writer) -> str:

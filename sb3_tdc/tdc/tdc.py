@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -29,6 +30,7 @@ from sb3_tdc.tdc.quantiles import (
     quantile_huber_gradient,
     quantile_huber_loss,
 )
+from sb3_tdc.tdc.transitions import check_first_observation, check_transition
 
 SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
@@ -553,24 +555,17 @@ class TDC(OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        observations = new_obs if isinstance(new_obs, dict) else {"observation": new_obs}
-        values: list[tuple[str, Any]] = [("action", buffer_action), ("reward", reward), *observations.items()]
-        for info in (info for info, done in zip(infos, dones, strict=True) if done):
-            last = info.get("terminal_observation")  # new_obs is the first of the next episode already
-            if isinstance(last, dict):
-                values += [(name, last[name]) for name in observations if name in last]
-            else:
-                values.append(("terminal observation", last))
-        for name, value in values:
-            array = np.asarray(value)  # environments may return numbers and lists
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
-                source = "policy chose an" if name == "action" else "environment returned a non-finite"
-                raise NonFiniteError(
-                    f"The {source} {name} of {array} at timestep {self.num_timesteps} (update {self._n_updates}). "
-                    "Training has stopped; the transition was not stored."
-                )
+        try:
+            check_transition(self, buffer_action, new_obs, reward, dones, infos)
+        except NonFiniteError:
+            self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
+            raise
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        check_first_observation(self)
+        return prepared
 
     def learn(
         self: SelfTDC,

@@ -11,7 +11,7 @@ from sb3_tdc.checkpoint.store import BrokenCheckpointError, Store
 
 @pytest.fixture
 def store(tmp_path):
-    store = Store(tmp_path / "checkpoints", keep=2)
+    store = Store(tmp_path / "checkpoints", keep=2, span=0)
     yield store
     store.close()
 
@@ -133,6 +133,21 @@ def test_a_full_disk_leaves_no_trace(store, monkeypatch):
 
 def test_one_process_at_a_time(store):
     with pytest.raises(ValueError, match="Another process writes checkpoints"):
-        Store(store.folder, 2)
+        Store(store.folder, 2, 0)
     store.close()
-    Store(store.folder, 2).close()
+    Store(store.folder, 2, 0).close()
+
+
+def test_there_is_always_an_older_one_to_go_back_to(tmp_path):
+    store = Store(tmp_path / "checkpoints", keep=2, span=50)
+    for step in range(0, 400, 7):
+        write(store, step)
+        steps = store.steps()
+        assert steps[:2] == [s for s in (step, step - 7) if s >= 0]
+        assert len(steps) <= 4
+        if step >= 50:
+            assert any(50 <= step - s <= 100 + 7 for s in steps)
+        assert all(store.at(s).step == s for s in steps)  # with the shared files that they need
+    with pytest.raises(ValueError, match=r"no checkpoint of step 1; there are: 399, 392, \d+, \d+$"):
+        store.at(1)
+    store.close()
