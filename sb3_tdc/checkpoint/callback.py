@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_tdc.checkpoint import replay, state
-from sb3_tdc.checkpoint.codec import NotRestoredError
+from sb3_tdc.checkpoint.codec import Initial, NotRestoredError
 from sb3_tdc.checkpoint.store import Store, Stored
 from sb3_tdc.tdc.diagnostics import NonFiniteError
 
@@ -68,6 +68,9 @@ class Checkpoints(BaseCallback):
         self._to_restore: Stored | None = None
         self._parts: dict[str, Any] = {}
         self._changed: tuple[str, ...] = ()
+        self.root: BaseCallback = self  # of all callbacks, while training
+        self._initial: Initial | None = None  # what was captured when training began
+        self._told: set[str] = set()
         self._segments: list[replay.Segment] = []
         self._digests: dict[str, str] = {}
         self._before: tuple[int, int] | None = None  # position in the replay buffer and timestep of the last segment
@@ -103,7 +106,7 @@ class Checkpoints(BaseCallback):
         return stored.step
 
     def _on_training_start(self) -> None:
-        self.root: BaseCallback = self.locals["callback"]
+        self.root = self.locals["callback"]
         if self._to_restore is None:
             newest = max(self.store.steps(), default=None)
             if newest is not None and newest != self.last_step:
@@ -114,6 +117,7 @@ class Checkpoints(BaseCallback):
             return
         self.model.num_timesteps = self._to_restore.step  # for the callbacks behind this one
         if self._to_restore.step >= self.locals["total_timesteps"]:
+            self._verify()
             self._restore()  # there will be no rollout
 
     def _restore(self) -> None:
@@ -126,7 +130,11 @@ class Checkpoints(BaseCallback):
         state.restore_weights(model, weights)
         with np.load(stored.path / "arrays.npz", allow_pickle=False) as arrays:
             numbered = [arrays[str(i)] for i in range(len(arrays.files))]
-        restarted = state.restore_state(model, self.root, parts["state"], numbered, stored.step, self._changed)
+        context = state.restoring(model, numbered, stored.step, self._relocation(parts["origin"]))
+        state.restore_state(model, self.root, parts["state"], context, self._changed)
+        restarted = [why for why in context.restarted if why.startswith("env")]
+        for why in (*context.not_restored, *(why for why in context.restarted if why not in restarted)):
+            warnings.warn(f"Not restored: {why}", RuntimeWarning, stacklevel=2)
         self._put_files_back(stored, parts["files"])
         self.store.remove_after(stored.step)
         self._digests, self.last_step = dict(stored.shared), stored.step
@@ -156,7 +164,30 @@ class Checkpoints(BaseCallback):
 
     # ---------------------------------------------------------------- saving
 
+    def verify(self, model: OffPolicyAlgorithm) -> list[str]:
+        """
+        Find out what a resumed run would not have: capture everything but weights and transitions, restore it into
+        the same objects, capture it again and compare. Training begins with it; what it names is told in warnings.
+
+        :param model: with its environments; outside ``learn``, callbacks are not looked at
+        :return: a sentence for each, which begins with its path
+        """
+        return state.verify(model, self.root)[0]
+
+    def _verify(self) -> None:
+        """At the start, and again in every process that resumes."""
+        names, self._initial = state.verify(self.model, self.root)  # type: ignore[arg-type]
+        self._tell(names)
+
+    def _tell(self, names: list[str]) -> None:
+        for name in dict.fromkeys(names):
+            if name not in self._told:
+                warnings.warn(f"Not in the checkpoints: {name}", RuntimeWarning, stacklevel=2)
+        self._told.update(names)
+
     def _on_rollout_start(self) -> None:
+        if self._initial is None:
+            self._verify()
         if self._to_restore is not None:
             self._restore()
             return
@@ -182,11 +213,13 @@ class Checkpoints(BaseCallback):
     def _write(self, step: int) -> None:
         model: Any = self.model
         _refuse_non_finite(step, state.find_non_finite(model))
-        parts, context = state.capture_state(model, self.root)
+        parts, context = state.capture_state(model, self.root, self._initial)
+        self._tell(context.left_out)
         segments, digests = self._write_segment(step)
         files = [*self.files, *state.files_of_evaluations(self.root)]
         content = {
             "run": state.describe_run(model),
+            "origin": {"working directory": os.getcwd(), "folder": os.path.abspath(self.store.folder.parent)},
             "platform": state.describe_platform(model),
             "state": parts,
             "segments": [asdict(segment) for segment in segments],
@@ -202,9 +235,6 @@ class Checkpoints(BaseCallback):
         stats = {file: file.stat() for file in files if file.exists()}
         writers |= {f"file_{i}": self._copier(file) for i, file in enumerate(files) if file in stats}
         stored = self.store.write(step, writers, digests)
-        if self.last_step is None and self.verbose > 0:
-            for why in dict.fromkeys(context.left_out):
-                print(f"Not in the checkpoints: {why}")
         self._segments, self._digests, self.last_step = segments, digests, step
         self._before = model.replay_buffer.pos, step
         self._kept = {file: (stats[file], stored.path / f"file_{i}") for i, file in enumerate(files) if file in stats}
@@ -238,6 +268,17 @@ class Checkpoints(BaseCallback):
             shutil.copyfile(file, path)
 
         return copy
+
+    def _relocation(self, origin: dict[str, str]) -> Callable[[str], str]:
+        """:return: what finds a path of the folder that held the checkpoints in the one that holds them now"""
+
+        def relocate(path: str) -> str:
+            then = Path(os.path.normpath(Path(origin["working directory"], path)))
+            if not then.is_relative_to(origin["folder"]):
+                return path
+            return str(self.store.folder.parent / then.relative_to(origin["folder"]))
+
+        return relocate
 
     def _put_files_back(self, stored: Stored, saved: list[str | None]) -> None:
         files = [*self.files, *state.files_of_evaluations(self.root)]

@@ -3,19 +3,25 @@ The state of Python objects as JSON and arrays, and back into objects that are t
 
 ``capture`` walks an object graph; ``restore`` walks the same graph, built anew, and gives it the values. What can hold
 a state that Python does not see (a native object, a lock, a socket) is refused by its path: an object is captured
-whole, or not at all.
+whole, or not at all. Some values are made from what was captured alone; others have to be there already (an object of
+a class, a function). :func:`uncovered` says which of these were not there when training began, and so will not be when
+the run is resumed.
 """
 
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
+from torch import nn
 
-_SCALARS = (type(None), bool, int, float, str)
 MISSING: Any = object()
+# Deeper nesting could be captured, but not restored within Python's limit of recursion
+_DEEPEST = 100
 
 
 class NotCapturedError(TypeError):
@@ -26,59 +32,142 @@ class NotRestoredError(ValueError):
     """A captured state that does not fit what was built; the message names the path."""
 
 
+def is_scalar(value: Any) -> bool:
+    """Whether JSON gives a value back as it was."""
+    if type(value) is int:
+        return abs(value) < 1 << 63
+    if type(value) is str:
+        return value.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in value)
+    return value is None or type(value) in (bool, float)
+
+
+def head(node: dict[str, Any]) -> tuple[str, Any]:
+    """:return: the kind of a captured value, and its content"""
+    return next(iter(node.items()))
+
+
+@dataclass(frozen=True)
+class Initial:
+    """
+    What was there when training began.
+
+    :param attributes: what was captured of those that can be left out, by path
+    :param shared: the paths of arrays that were parts of the same memory, each group as one text
+    """
+
+    attributes: dict[str, Any]
+    shared: set[str]
+
+
 class Capture:
     """
     One walk through object graphs that may share objects.
 
     :param known: objects that are somebody else's to capture, by name
+    :param initial: of the capture of the objects as they were built; None for that capture itself
     """
 
-    def __init__(self, known: dict[str, Any] | None = None):
+    def __init__(self, known: dict[str, Any] | None = None, initial: Initial | None = None):
         self.arrays: list[np.ndarray] = []
         self.left_out: list[str] = []
+        self.attributes: dict[str, Any] = {}
+        self.first_arrays: dict[str, int] = {}  # of attributes that come from a capture of their own
+        self.shared_elsewhere: set[str] = set()  # memory, in such captures
+        self.initial = initial
         self._known = {id(value): name for name, value in (known or {}).items()}
         self._seen: dict[int, int] = {}
         self._alive: list[Any] = []
+        self._memory: dict[int, int] = {}
+        self._parts: list[tuple[int, str]] = []  # the memory of every array, and its path
+        self._depth = 0
 
     def capture(self, value: Any, path: str) -> Any:
         """
         :return: JSON
         :raises NotCapturedError: for what cannot be captured
         """
-        if type(value) in _SCALARS:
+        if is_scalar(value):
             return value
         if id(value) in self._known:
             return {"known": self._known[id(value)]}
         if id(value) in self._seen:
             return {"same": self._seen[id(value)]}
-        for tag, kind in KINDS.items():
-            if kind.matches(value):
-                if not kind.has_identity:
-                    return {tag: kind.capture(self, value, path)}
-                number = self._seen[id(value)] = len(self._alive)
-                self._alive.append(value)
-                return {tag: kind.capture(self, value, path), "number": number}
-        raise NotCapturedError(f"{path} is a {name_of(type(value))}")
+        if self._depth == _DEEPEST:
+            raise NotCapturedError(f"{path} is nested more than {_DEEPEST} deep")
+        tag = next((tag for tag, kind in KINDS.items() if kind.matches(value)), None)
+        if tag is None:
+            raise NotCapturedError(f"{path} is a {name_of(type(value))}")
+        self._depth += 1
+        try:
+            if not KINDS[tag].has_identity:
+                return {tag: KINDS[tag].capture(self, value, path)}
+            number = self._seen[id(value)] = len(self._alive)
+            self._alive.append(value)
+            return {tag: KINDS[tag].capture(self, value, path), "id": number}
+        finally:
+            self._depth -= 1
 
     def capture_attributes(self, values: dict[str, Any], path: str, optional: bool = False) -> dict[str, Any]:
-        """:param optional: leave out, and note, what cannot be captured"""
+        """:param optional: leave out, and note, what cannot be captured or will not be restored"""
+        if not optional:
+            return {name: self.capture(value, f"{path}.{name}") for name, value in values.items()}
         captured = {}
         for name, value in values.items():
-            n_arrays, seen = len(self.arrays), dict(self._seen) if optional else {}
-            try:
-                captured[name] = self.capture(value, f"{path}.{name}")
-            except NotCapturedError as error:
-                if not optional:
-                    raise
-                self.left_out.append(str(error))
-                del self.arrays[n_arrays:]
-                self._seen = seen
+            node = self.capture_optional(value, f"{path}.{name}")
+            if node is not MISSING:
+                captured[name] = node
         return captured
 
-    def add_array(self, array: np.ndarray) -> int:
-        """:return: its number"""
+    def capture_optional(self, value: Any, path: str) -> Any:
+        """:return: JSON, or MISSING for what cannot be captured or will not be restored"""
+        n_arrays, n_parts = len(self.arrays), len(self._parts)
+        seen, attributes = dict(self._seen), dict(self.attributes)
+        try:
+            node = self.capture(value, path)
+            if self.initial is not None:
+                for why in uncovered(node, self.initial.attributes.get(path), path):
+                    raise NotCapturedError(why)
+        except OSError:  # a full disk
+            raise
+        except Exception as error:
+            is_named = isinstance(error, NotCapturedError)
+            self.left_out.append(str(error) if is_named else f"{path} ({type(error).__name__}: {error})")
+            del self.arrays[n_arrays:], self._parts[n_parts:]
+            self._seen, self.attributes = seen, attributes
+            return MISSING
+        self.attributes[path] = node
+        return node
+
+    def add_array(self, array: np.ndarray) -> dict[str, int]:
+        """:return: what stands for it in JSON"""
         self.arrays.append(array)
-        return len(self.arrays) - 1
+        return {"#": len(self.arrays) - 1}
+
+    def note_memory(self, address: int | None, path: str) -> int:
+        """
+        :param address: where the memory begins that an array is a part of; None if it has no numbers
+        :return: the number of this memory
+        """
+        number = len(self._parts) if address is None else self._memory.setdefault(address, len(self._parts))
+        self._parts.append((number, path))
+        return number
+
+    def as_initial(self) -> Initial:
+        """:return: what later captures are compared with"""
+        return Initial(self.attributes, self.shared_memory())
+
+    def tell_shared_memory(self) -> None:
+        """Note what shares its memory and did not when training began: it will not when the run is resumed."""
+        if self.initial is not None:
+            new = sorted(self.shared_memory() - self.initial.shared)
+            self.left_out += [f"{group} share their memory, and did not when training began" for group in new]
+
+    def shared_memory(self) -> set[str]:
+        """:return: the paths of arrays that are parts of the same memory, each group as one text"""
+        paths: dict[int, list[str]] = {}
+        for number, path in self._parts:
+            paths.setdefault(number, []).append(path)
+        return self.shared_elsewhere | {" and ".join(sorted(group)) for group in paths.values() if len(group) > 1}
 
 
 class Restore:
@@ -88,49 +177,103 @@ class Restore:
     :param arrays: of the :class:`Capture`
     :param known: as there
     :param step: the timestep of the capture
+    :param with_files: restore files too
+    :param relocate: where a path of then is now
     """
 
-    def __init__(self, arrays: list[np.ndarray], known: dict[str, Any] | None = None, step: int = 0):
-        self.arrays, self.known, self.step = arrays, known or {}, step
+    def __init__(
+        self,
+        arrays: list[np.ndarray],
+        known: dict[str, Any] | None = None,
+        step: int = 0,
+        with_files: bool = True,
+        relocate: Callable[[str], str] = str,
+    ):
+        self.known, self.step, self.with_files, self.relocate = known or {}, step, with_files, relocate
         self.restarted: list[str] = []
+        self.not_restored: list[str] = []
+        self._arrays = arrays
         self._seen: dict[int, Any] = {}
+        self._numbers: list[int | None] = []  # of the values under way
+        self._claimed: dict[int, Any] = {}
+        self._memory: dict[int, int] = {}
 
     def restore(self, node: Any, existing: Any, path: str) -> Any:
         """
         :param node: what was captured
-        :param existing: what is there now, of which objects are kept
+        :param existing: what is there now; it becomes the value where it can, so that whoever has it has the value
         :return: the value
         :raises NotRestoredError: if it does not fit
         """
-        if type(node) in _SCALARS:
-            return node
-        tag, content = next(iter(node.items()))
+        if not isinstance(node, dict):
+            return existing if type(existing) is type(node) and repr(existing) == repr(node) else node
+        tag, content = head(node)
         if tag == "known":
             return self.known[content]
         if tag == "same":
             if content not in self._seen:
                 raise NotRestoredError(f"{path} was part of what could not be restored")
             return self._seen[content]
-        if "number" in node:
-            self._seen[node["number"]] = existing  # until it is there: an object is, a container in itself is not
+        self._numbers.append(node.get("id"))
         value = KINDS[tag].restore(self, content, existing, path)
-        if "number" in node:
-            self._seen[node["number"]] = value
+        self.begin(value)
+        self._numbers.pop()
         return value
 
-    def restore_attributes(self, nodes: dict[str, Any], owner: Any, path: str) -> None:
-        """Set the attributes of an object."""
+    def begin(self, value: Any) -> None:
+        """What is inside a value may refer to it: name it before that is restored."""
+        if self._numbers[-1] is not None:
+            self._seen[self._numbers[-1]] = value
+
+    def claims(self, existing: Any) -> bool:
+        """Whether what is there may become the value: not if another one, that was apart from it, has become it."""
+        is_free = existing is not MISSING and id(existing) not in self._claimed
+        if is_free:
+            self._claimed[id(existing)] = existing  # alive, so that its id stays its own
+        return is_free
+
+    def claims_memory(self, memory: int, there: int) -> bool:
+        """The same for the memory that arrays are parts of."""
+        return self._memory.setdefault(there, memory) == memory
+
+    def restore_attributes(self, nodes: dict[str, Any], owner: Any, path: str, optional: bool = False) -> None:
+        """
+        Set the attributes of an object.
+
+        :param optional: leave an attribute that cannot be restored as it is, and note it
+        """
         for name, node in nodes.items():
             existing = attributes_of(owner).get(name, MISSING)
-            value = self.restore(node, existing, f"{path}.{name}")
-            if value is not existing:
-                object.__setattr__(owner, name, value)
+            depth = len(self._numbers)
+            try:
+                value = self.restore(node, existing, f"{path}.{name}")
+                if value is not existing:
+                    object.__setattr__(owner, name, value)
+            except Exception as error:
+                if not optional:
+                    raise
+                del self._numbers[depth:]
+                is_named = isinstance(error, NotRestoredError)
+                self.not_restored.append(str(error) if is_named else f"{path}.{name} ({type(error).__name__}: {error})")
+
+    def array(self, content: dict[str, int]) -> np.ndarray:
+        """:return: the array that a content stands for, to be copied"""
+        return self._arrays[content["#"]]
+
+
+def no_children(content: Any) -> dict[str, Any]:
+    """:return: nothing, as there is in a value without parts"""
+    return {}
 
 
 class Kind:
-    """How one kind of value is captured and restored."""
+    """
+    How one kind of value is captured and restored.
 
-    has_identity = True
+    :param needs: what has to be there to restore a content, as a text; None if it is made from the content alone
+    :param children: the values inside a content, by how their paths go on
+    :param has_identity: whether it matters if two of these are one
+    """
 
     def __init__(
         self,
@@ -138,24 +281,56 @@ class Kind:
         capture: Callable[[Capture, Any, str], Any],
         restore: Callable[[Restore, Any, Any, str], Any],
         has_identity: bool = True,
+        needs: Callable[[Any], str | None] = lambda content: None,
+        children: Callable[[Any], dict[str, Any]] = no_children,
     ):
         self.matches, self.capture, self.restore, self.has_identity = matches, capture, restore, has_identity
+        self.needs, self.children = needs, children
 
 
 def plain(
-    matches: Callable[[Any], bool], capture: Callable[[Any], dict[str, Any]], restore: Callable[[Any, Any], Any]
+    matches: Callable[[Any], bool],
+    capture: Callable[[Any], dict[str, Any]],
+    restore: Callable[[Any, Any], Any],
+    needs: Callable[[Any], str | None] = lambda content: None,
 ) -> Kind:
     """
     A kind whose state is a dict of plain values.
 
-    :param restore: takes the existing value and this dict, returns the value
+    :param restore: takes the existing value (MISSING if it has become another one) and this dict, returns the value
     """
 
     def restore_content(context: Restore, content: Any, existing: Any, path: str) -> Any:
         state = {name: context.restore(node, MISSING, f"{path}.{name}") for name, node in content.items()}
-        return restore(existing, state)
+        return restore(existing if context.claims(existing) else MISSING, state)
 
-    return Kind(matches, lambda context, value, path: context.capture_attributes(capture(value), path), restore_content)
+    return Kind(
+        matches,
+        lambda context, value, path: context.capture_attributes(capture(value), path),
+        restore_content,
+        needs=needs,
+    )
+
+
+def uncovered(node: Any, initial: Any, path: str) -> Iterator[str]:
+    """
+    What of a captured value cannot be restored into the objects that were there when training began.
+
+    :param node: the value
+    :param initial: what was captured at that time in its place
+    :return: sentences that begin with a path
+    """
+    if not isinstance(node, dict) or head(node)[0] in ("known", "same"):
+        return
+    tag, content = head(node)
+    there = head(initial)[1] if isinstance(initial, dict) and head(initial)[0] == tag else MISSING
+    needs = KINDS[tag].needs(content)
+    if needs is not None and (there is MISSING or KINDS[tag].needs(there) != needs):
+        yield f"{path} is {needs}, which was not there when training began"
+        return
+    initially = {} if there is MISSING else KINDS[tag].children(there)
+    for name, child in KINDS[tag].children(content).items():
+        yield from uncovered(child, initially.get(name), path + name)
 
 
 def existing_as(kind: Any, existing: Any, path: str) -> Any:
@@ -166,16 +341,8 @@ def existing_as(kind: Any, existing: Any, path: str) -> Any:
     return existing
 
 
-# How each kind is captured and restored: the first that matches counts (kinds.py)
+# How each kind is captured and restored: the first that matches counts. kinds.py has the table
 KINDS: dict[str, Kind] = {}
-LAST = "object"
-
-
-def add_kind(tag: str, kind: Kind) -> None:
-    """Capture something in its own way, before it is looked at as a Python object."""
-    last = KINDS.pop(LAST)
-    KINDS[tag] = kind
-    KINDS[LAST] = last
 
 
 def name_of(kind: Any) -> str:
@@ -187,6 +354,8 @@ def name_of(kind: Any) -> str:
 _SKIPPED: dict[type, set[str]] = {
     BaseCallback: {"model", "locals", "globals", "parent"},
     VecEnvWrapper: {"class_attributes"},
+    gym.Wrapper: {"_cached_spec"},
+    nn.RNNBase: {"_flat_weight_refs"},
 }
 
 

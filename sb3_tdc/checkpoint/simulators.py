@@ -8,19 +8,18 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_tdc.checkpoint import kinds  # noqa: F401  # these come before its own
 from sb3_tdc.checkpoint.codec import (
     MISSING,
     Capture,
-    Kind,
     NotCapturedError,
     NotRestoredError,
     Restore,
-    add_kind,
+    attributes_of,
     existing_as,
-    plain,
+    uncovered,
 )
 from sb3_tdc.checkpoint.event_files import capture_event_files, restore_event_files
+from sb3_tdc.checkpoint.generators import GENERATORS
 
 
 class Restorable(gym.Wrapper):
@@ -30,63 +29,88 @@ class Restorable(gym.Wrapper):
         """:return: of :func:`capture_env`"""
         return capture_env(self)
 
-    def restore_state(self, state: dict[str, Any]) -> str | None:
+    def restore_state(self, state: dict[str, Any], with_files: bool = True) -> str | None:
         """:return: of :func:`restore_env`"""
-        return restore_env(self, state)
+        return restore_env(self, state, with_files)
 
 
 def capture_env(env: gym.Env) -> dict[str, Any]:
     """
-    :return: the environment, or if it cannot be captured its generator and its ``Monitor`` alone, and why. Of plain
-        values and arrays
+    :return: generators and the ``Monitor``, so that these go on whatever else does not; then the environment, or why it
+        cannot be captured. Of plain values and arrays
     """
-    context = Capture()
-    why, content = None, None
-    try:
-        content = context.capture(env, "env")
-    except NotCapturedError as error:
-        context, why = Capture(), str(error)
-        monitors = [context.capture_attributes(_without_env(m), "Monitor", optional=True) for m in _monitors(env)]
-        content = [context.capture(getattr(env.unwrapped, "_np_random", None), "np_random"), monitors]
-    return {"why": why, "content": content, "arrays": context.arrays}
+    monitors = _monitors(env)
+    context = Capture(_known(monitors))
+    generators = {
+        name: {a: value for a, value in attributes_of(owner).items() if isinstance(value, GENERATORS)}
+        for name, owner in _owners(env).items()
+    }
+    content: dict[str, Any] = {
+        "generators": {n: context.capture_attributes(g, n, optional=True) for n, g in generators.items()},
+        "monitors": [context.capture_attributes(_without_env(m), "Monitor", optional=True) for m in monitors],
+    }
+    whole = context.capture_optional([env, *(monitor.env for monitor in monitors)], "env")
+    why = context.left_out[-1] if whole is MISSING else None
+    content["whole"] = whole if why is None else None
+    shared = sorted(context.shared_memory())
+    return {"why": why, "content": content, "arrays": context.arrays, "left_out": context.left_out, "shared": shared}
 
 
-def restore_env(env: gym.Env, state: dict[str, Any]) -> str | None:
+def restore_env(env: gym.Env, state: dict[str, Any], with_files: bool = True) -> str | None:
     """
+    :param with_files: restore files too
     :return: None, or why the episode has to be started again
     """
-    context = Restore(state["arrays"])
-    if state["why"] is None:
-        try:
-            context.restore(state["content"], env, "env")
-        except NotRestoredError as error:
-            return str(error)
-        return None
-    generator, monitors = state["content"]
-    restored = context.restore(generator, getattr(env.unwrapped, "_np_random", None), "np_random")
-    for monitor, attributes in zip(_monitors(env), monitors, strict=False):
-        context.restore_attributes(attributes, monitor, "Monitor")
-    if restored is not None:
-        env.unwrapped.np_random = restored
-    return state["why"]
+    if state["content"] is None:
+        return state["why"]
+    monitors = _monitors(env)
+    context = Restore(state["arrays"], _known(monitors), with_files=with_files)
+    for name, owner in _owners(env).items():
+        nodes = state["content"]["generators"].get(name, {})
+        context.restore_attributes(nodes, owner, name, optional=True)
+    for monitor, attributes in zip(monitors, state["content"]["monitors"], strict=False):
+        context.restore_attributes(attributes, monitor, "Monitor", optional=True)
+    if state["why"] is not None:
+        return state["why"]
+    try:
+        context.restore(state["content"]["whole"], [env, *(monitor.env for monitor in monitors)], "env")
+    except Exception as error:
+        return str(error) if isinstance(error, NotRestoredError) else f"{type(error).__name__}: {error}"
+    return next(iter(context.not_restored), None)
 
 
 def _monitors(env: gym.Env) -> list[Monitor]:
-    found = []
-    while isinstance(env, gym.Wrapper):
-        found += [env] if isinstance(env, Monitor) else []
-        env = env.env
-    return found
+    return [layer for layer in _layers(env) if isinstance(layer, Monitor)]
+
+
+def _layers(env: gym.Env) -> list[gym.Env]:
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    return layers
+
+
+def _known(monitors: list[Monitor]) -> dict[str, Any]:
+    return {f"monitor {i}": monitor for i, monitor in enumerate(monitors)}
 
 
 def _without_env(monitor: Monitor) -> dict[str, Any]:
-    return {name: value for name, value in vars(monitor).items() if name != "env"}
+    return {name: value for name, value in attributes_of(monitor).items() if name != "env"}
+
+
+def _owners(env: gym.Env) -> dict[str, Any]:
+    """:return: what has generators: an environment, its wrappers, and their spaces"""
+    layers = {f"env{'.env' * i}": layer for i, layer in enumerate(_layers(env))}
+    spaces = ("action_space", "observation_space")
+    parts = {f"{name}.{space}": vars(layer).get(space) for name, layer in layers.items() for space in spaces}
+    return {name: owner for name, owner in (layers | parts).items() if owner is not None}
 
 
 # ---------------------------------------------------------------- MuJoCo
 
 
-def _is_mujoco(name: str) -> Any:
+def is_mujoco(name: str) -> Any:
+    """:return: whether a value is one of MuJoCo's of this name"""
     return lambda value: type(value).__name__ == name and type(value).__module__.startswith("mujoco")
 
 
@@ -94,7 +118,7 @@ def _model_bytes(model: Any) -> bytes:
     return model.__getstate__()
 
 
-def _capture_mj_data(data: Any) -> dict[str, Any]:
+def capture_mj_data(data: Any) -> dict[str, Any]:
     """MuJoCo's own bytes of the whole ``MjData``, without the model that it puts among them."""
     whole, model = data.__getstate__(), _model_bytes(data.model)
     before, found, after = whole.partition(model)
@@ -103,7 +127,8 @@ def _capture_mj_data(data: Any) -> dict[str, Any]:
     return {"before": before, "after": after, "model": hashlib.sha256(model).hexdigest()}
 
 
-def _restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
+def restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
+    """Give an ``MjData`` that is there its state, if it is of the same model."""
     import mujoco
 
     model = _model_bytes(existing_as(mujoco.MjData, existing, "MjData").model)
@@ -115,35 +140,64 @@ def _restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
     return existing
 
 
+def restore_mj_model(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """:return: what is there"""
+    import mujoco
+
+    return existing_as(mujoco.MjModel, existing, path)
+
+
 # ---------------------------------------------------------------- vectorised environments
 
 
-def _capture_vec_env(context: Capture, env: Any, path: str) -> Any:
+def is_vec_env(value: Any) -> bool:
+    """Whether it has the environments."""
+    return isinstance(value, (DummyVecEnv, SubprocVecEnv))
+
+
+def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
+    """:return: every environment, in this process or its own"""
     if isinstance(env, DummyVecEnv):
         states = [capture_env(single) for single in env.envs]
     elif env.has_attr("capture_state"):
         states = env.env_method("capture_state")
     else:
         why = f"{path} is a SubprocVecEnv: wrap its environments in sb3_tdc.checkpoint.Restorable (wrapper_class)"
-        states = [{"why": why, "content": None, "arrays": []} for _ in range(env.num_envs)]
-    context.left_out += dict.fromkeys(state["why"] for state in states if state["why"] is not None)
+        states = [
+            {"why": why, "content": None, "arrays": [], "left_out": [why], "shared": []} for _ in range(env.num_envs)
+        ]
     captured = []
-    for state in states:
+    for i, state in enumerate(states):
+        context.first_arrays[f"{path}, environment {i}"] = len(context.arrays)
+        _tell_what_is_not_covered(context, state, f"{path}, environment {i}")
         numbers = [context.add_array(array) for array in state["arrays"]]
         captured.append({"why": state["why"], "content": state["content"], "arrays": numbers})
     return [captured, context.capture_attributes(_own_attributes(env), path)]
 
 
-def _restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
+def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str) -> None:
+    context.left_out += state["left_out"]
+    context.shared_elsewhere |= {f"{path}: {group}" for group in state["shared"]}
+    if state["why"] is not None:
+        return
+    whole = context.attributes[path] = state["content"]["whole"]
+    if context.initial is not None:
+        missing = uncovered(whole, context.initial.attributes.get(path), path)
+        context.left_out += [f"{why}: its episode will begin again" for why in missing]
+
+
+def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Give every environment its state, and note those whose episode has to start again."""
     env = existing_as((DummyVecEnv, SubprocVecEnv), existing, path)
     captured, attributes = content
     if len(captured) != env.num_envs:
         raise NotRestoredError(f"{path} had {len(captured)} environments, and has {env.num_envs}")
-    states = [{**state, "arrays": [context.arrays[number] for number in state["arrays"]]} for state in captured]
+    states = [{**state, "arrays": [context.array(number) for number in state["arrays"]]} for state in captured]
     if isinstance(env, DummyVecEnv):
-        whys = [restore_env(single, state) for single, state in zip(env.envs, states, strict=True)]
+        whys = [restore_env(single, state, context.with_files) for single, state in zip(env.envs, states, strict=True)]
     elif env.has_attr("restore_state"):
-        whys = [env.env_method("restore_state", state, indices=i)[0] for i, state in enumerate(states)]
+        arguments = [(state, context.with_files) for state in states]
+        whys = [env.env_method("restore_state", *both, indices=i)[0] for i, both in enumerate(arguments)]
     else:
         whys = [state["why"] or "there is no sb3_tdc.checkpoint.Restorable around it" for state in states]
     context.restarted += [f"{path}, environment {i}: {why}" for i, why in enumerate(whys) if why is not None]
@@ -151,9 +205,22 @@ def _restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -
     return existing
 
 
-def _restore_event_files(context: Restore, content: Any, existing: Any, path: str) -> Any:
+def is_event_files(value: Any) -> bool:
+    """Whether it writes event files."""
+    return isinstance(value, TensorBoardOutputFormat)
+
+
+def capture_output(context: Capture, value: TensorBoardOutputFormat, path: str) -> Any:
+    """:return: how far its files go"""
+    return context.capture(capture_event_files(value), path)
+
+
+def restore_output(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Cut event files to what they were."""
     output = existing_as(TensorBoardOutputFormat, existing, path)
-    restore_event_files(output, context.restore(content, MISSING, path), context.step)
+    state = context.restore(content, MISSING, path)
+    if context.with_files:
+        restore_event_files(output, state, context.step)
     return output
 
 
@@ -161,24 +228,3 @@ def _own_attributes(env: VecEnv) -> dict[str, Any]:
     """What else there is is overwritten by every step."""
     names = ("observation_space", "action_space", "_seeds", "_options")
     return {name: vars(env)[name] for name in names}
-
-
-def _is_vec_env(value: Any) -> bool:
-    return isinstance(value, (DummyVecEnv, SubprocVecEnv))
-
-
-add_kind("MjData", plain(_is_mujoco("MjData"), _capture_mj_data, _restore_mj_data))
-# Part of the MjData of every environment that has one; the two are compared there
-add_kind(
-    "MjModel",
-    Kind(_is_mujoco("MjModel"), lambda context, value, path: None, lambda context, content, existing, path: existing),
-)
-add_kind("environments", Kind(_is_vec_env, _capture_vec_env, _restore_vec_env))
-add_kind(
-    "event files",
-    Kind(
-        lambda value: isinstance(value, TensorBoardOutputFormat),
-        lambda context, value, path: context.capture(capture_event_files(value), path),
-        _restore_event_files,
-    ),
-)

@@ -1,9 +1,10 @@
 """Everything that the rest of a run depends on: captured between two rollouts, restored before the first."""
 
+import json
 import platform
 import random
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_tdc.checkpoint.codec import Capture, Restore
+from sb3_tdc.checkpoint import kinds  # noqa: F401  # the table that all of this goes by
+from sb3_tdc.checkpoint.codec import MISSING, Capture, Initial, NotRestoredError, Restore, name_of
+from sb3_tdc.checkpoint.compare import differences
 from sb3_tdc.checkpoint.replay import other_attributes
 from sb3_tdc.tdc.checks import find_non_finite as find_non_finite_weights
 from sb3_tdc.versions import library_versions
@@ -27,57 +30,119 @@ _NOT_THE_RUN = {"env", "policy", "replay_buffer", "tensorboard_log", "verbose", 
 _OF_THE_RUN = {"_diagnostics"}
 
 
-def capture_state(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[dict[str, Any], Capture]:
+def capture_state(
+    model: OffPolicyAlgorithm, callback: BaseCallback, initial: Initial | None = None
+) -> tuple[dict[str, Any], Capture]:
     """
+    What cannot be captured, or would not be restored, is left out and noted.
+
     :param callback: the root of all callbacks
+    :param initial: of the capture of all this as it was built; None for that capture itself
     :return: JSON, and the :class:`Capture` with its arrays
-    :raises NotCapturedError: if the algorithm has an attribute that cannot be captured
     """
-    context = Capture({"model": model})
+    context = Capture(_known(model), initial)
     parts: dict[str, Any] = {
-        "model": context.capture_attributes(_attributes(model), "model"),
-        "replay_buffer": context.capture_attributes(other_attributes(_buffer(model)), "replay_buffer"),
-        "env": context.capture(model.env, "env"),
-        "callbacks": context.capture(callback, "callbacks"),
+        "model": context.capture_attributes(_attributes(model), "model", optional=True),
+        "replay_buffer": context.capture_attributes(other_attributes(_buffer(model)), "replay_buffer", optional=True),
+        "env": _capture_optional(context, model.env, "env"),
+        "names of callbacks": [name_of(type(each)) for each in callbacks_of(callback)],
+        "callbacks": _capture_optional(context, callback, "callbacks"),
         "logger": context.capture_attributes(_logger_attributes(model), "logger", optional=True),
         "seconds": (time.time_ns() - model.start_time) / 1e9,
         "random": context.capture(_random_state(), "random"),
     }
+    context.tell_shared_memory()
     return parts, context
+
+
+def _capture_optional(context: Capture, value: Any, path: str) -> Any:
+    node = context.capture_optional(value, path)
+    return None if node is MISSING else node
 
 
 def restore_state(
     model: OffPolicyAlgorithm,
     callback: BaseCallback,
     parts: dict[str, Any],
-    arrays: list[np.ndarray],
-    step: int,
+    context: Restore,
     changed: Sequence[str] = (),
-) -> list[str]:
+) -> None:
     """
     Everything but the weights and the rings of the replay buffer, which are there already.
 
+    :param context: with the arrays; it notes what could not be restored, and why episodes have to be started again
     :param changed: hyperparameters that stay as they are, out of ``CHANGEABLE``
-    :return: why episodes have to be started again, if they do
-    :raises NotRestoredError: if the model, its environments or its callbacks are others than those captured
+    :raises NotRestoredError: if the callbacks are others than those captured
     """
-    context = Restore(arrays, {"model": model}, step)
-    kept = {attribute for name in changed for attribute in CHANGEABLE[name]}
-    for owner, path in ((model, "model"), (_buffer(model), "replay_buffer")):
-        nodes = {name: node for name, node in parts[path].items() if name not in kept}
-        context.restore_attributes(nodes, owner, path)
-    context.restore(parts["env"], model.env, "env")
-    restarted = list(context.restarted)
-    context.restore(parts["callbacks"], callback, "callbacks")
-    context.restore_attributes(parts["logger"], model.logger, "logger")
+    names = [name_of(type(each)) for each in callbacks_of(callback)]
+    if names != parts["names of callbacks"]:
+        raise NotRestoredError(
+            f"The callbacks were {', '.join(parts['names of callbacks'])}, and are {', '.join(names)}"
+        )
+    _restore_values(model, callback, parts, context, changed)
+    restarted = [why for why in context.restarted if why.startswith("env")]
     model.start_time = time.time_ns() - int(parts["seconds"] * 1e9)
     if restarted:
         _restart_episodes(model)
     bind_fused_update = getattr(model, "_bind_fused_update", None)
     if bind_fused_update is not None and model._n_updates > 0:
         bind_fused_update(model.batch_size)  # it also chooses the actions
-    _set_random_state(context.restore(parts["random"], None, "random"))  # last: all of the above may draw
-    return restarted
+    _set_random_state(context.restore(parts["random"], MISSING, "random"))  # last: all of the above may draw
+
+
+def _restore_values(
+    model: OffPolicyAlgorithm,
+    callback: BaseCallback,
+    parts: dict[str, Any],
+    context: Restore,
+    changed: Sequence[str] = (),
+) -> None:
+    kept = {attribute for name in changed for attribute in CHANGEABLE[name]}
+    for owner, path in ((model, "model"), (_buffer(model), "replay_buffer")):
+        nodes = {name: node for name, node in parts[path].items() if name not in kept}
+        context.restore_attributes(nodes, owner, path, optional=True)
+    for node, value, path in ((parts["env"], model.env, "env"), (parts["callbacks"], callback, "callbacks")):
+        if node is not None:
+            context.restore(node, value, path)
+    context.restore_attributes(parts["logger"], model._logger, "logger", optional=True)
+
+
+def restoring(
+    model: OffPolicyAlgorithm, arrays: list[np.ndarray], step: int = 0, relocate: Callable[[str], str] = str
+) -> Restore:
+    """:return: the context for :func:`restore_state`"""
+    return Restore(arrays, _known(model), step, relocate=relocate)
+
+
+def verify(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[list[str], Initial]:
+    """
+    Capture, restore into the same objects, capture again, compare. Files are left alone.
+
+    :return: sentences that begin with the path of what a resumed run would not have, and what later captures
+        are compared with
+    """
+    parts, before = capture_state(model, callback)
+    context = Restore(before.arrays, _known(model), with_files=False)
+    _restore_values(model, callback, json.loads(json.dumps(parts)), context)
+    after = capture_state(model, callback, before.as_initial())[1]
+    _set_random_state(context.restore(parts["random"], MISSING, "random"))
+    differing = [f"{path} does not come back as it was" for path in differences(before, after)]
+    return [
+        *before.left_out,
+        *context.not_restored,
+        *context.restarted,
+        *differing,
+        *after.left_out,
+    ], before.as_initial()
+
+
+def _known(model: OffPolicyAlgorithm) -> dict[str, Any]:
+    """What is captured on its own, and may be referred to from anywhere."""
+    known: dict[str, Any] = {"model": model, "replay_buffer": model.replay_buffer}
+    known |= {f"policy.{name}": module for name, module in model.policy.named_modules()}
+    known |= {f"policy.{name}": parameter for name, parameter in model.policy.named_parameters()}
+    state_dicts, tensors = model._get_torch_save_params()
+    return known | {name: recursive_getattr(model, name) for name in (*state_dicts, *tensors)}
 
 
 def _attributes(model: OffPolicyAlgorithm) -> dict[str, Any]:
@@ -88,7 +153,8 @@ def _attributes(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def _logger_attributes(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    return {name: value for name, value in vars(model.logger).items() if name not in ("dir", "level")}
+    logger = getattr(model, "_logger", None)  # there is none before learn()
+    return {name: value for name, value in vars(logger).items() if name not in ("dir", "level")} if logger else {}
 
 
 def _buffer(model: OffPolicyAlgorithm) -> Any:
@@ -238,20 +304,29 @@ def describe_platform(model: OffPolicyAlgorithm) -> dict[str, str]:
     }
 
 
+def callbacks_of(callback: BaseCallback) -> list[BaseCallback]:
+    """
+    :param callback: the root of all callbacks
+    :return: it, and those that it holds, directly or in lists
+    """
+    reached = [callback]
+    for callback in reached:  # grows
+        if getattr(callback, "is_checkpointed", True):
+            values = [item for v in vars(callback).values() for item in (v if isinstance(v, list) else [v])]
+            reached += [v for v in values if isinstance(v, BaseCallback) and not any(v is r for r in reached)]
+    return reached
+
+
 def files_of_evaluations(callback: BaseCallback) -> list[Path]:
     """
     :param callback: the root of all callbacks
     :return: what every ``EvalCallback`` among them rewrites
     """
     found: list[Path] = []
-    reached = [callback]
-    for callback in reached:  # grows
-        if isinstance(callback, EvalCallback):
-            if callback.best_model_save_path is not None:
-                found.append(Path(callback.best_model_save_path) / "best_model.zip")
-            if callback.log_path is not None:
-                found.append(Path(f"{callback.log_path}.npz"))
-        if getattr(callback, "is_checkpointed", True):
-            values = [item for v in vars(callback).values() for item in (v if isinstance(v, list) else [v])]
-            reached += [v for v in values if isinstance(v, BaseCallback) and not any(v is r for r in reached)]
+    for evaluation in callbacks_of(callback):
+        if isinstance(evaluation, EvalCallback):
+            if evaluation.best_model_save_path is not None:
+                found.append(Path(evaluation.best_model_save_path) / "best_model.zip")
+            if evaluation.log_path is not None:
+                found.append(Path(f"{evaluation.log_path}.npz"))
     return found

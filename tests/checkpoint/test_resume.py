@@ -1,9 +1,11 @@
 """``train.py --resume`` and ``Checkpoints``: what a user sees when a run is stopped, damaged, or not what it was."""
 
 import errno
+import functools
 import hashlib
 import json
 import os
+import random
 import re
 import shutil
 import signal
@@ -23,7 +25,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_tdc import TDC, busy_machine, interruption, train
-from sb3_tdc.checkpoint import Checkpoints, NotCapturedError, Restorable, callback, state
+from sb3_tdc.checkpoint import Checkpoints, Restorable, callback, state
 from sb3_tdc.progress import ProgressCallback
 from tests.checkpoint import kill
 from tests.checkpoint.runs import Stop, StopAt, digest, files
@@ -341,12 +343,28 @@ def test_processes_without_the_wrapper_are_told_about_it(tmp_path):
         learn(make(), tmp_path)
 
 
-def test_an_algorithm_that_cannot_be_captured_is_named_before_it_trains(tmp_path):
+def cyclic():
+    """A tuple that contains itself, through a partial: it cannot be made piece by piece."""
+    parts = []
+    parts.append((parts, iter(())))
+    return parts
+
+
+def deep(n):
+    return functools.reduce(lambda inside, _: [inside], range(n), [])
+
+
+@pytest.mark.parametrize("what", [threading.Lock(), random.SystemRandom(), cyclic(), deep(5_000)], ids=type)
+def test_an_attribute_of_the_algorithm_that_cannot_be_captured_is_left_out_and_named(tmp_path, what):
     model = make_model()
-    model.lock = threading.Lock()
-    with pytest.raises(NotCapturedError, match=r"model\.lock is a _thread\.lock"):
-        learn(model, tmp_path)
-    assert model.num_timesteps == 0
+    model.extra = what
+    with pytest.warns(RuntimeWarning, match=r"Not in the checkpoints: model\.extra.* (is a|is nested)"):
+        learn(model, tmp_path, stop_at=70)
+    model = make_model()
+    model.extra = "as built"
+    assert learn(model, tmp_path) == 60
+    assert model.extra == "as built"
+    assert model.num_timesteps == 150
 
 
 def test_arguments_out_of_range(tmp_path):
