@@ -41,6 +41,10 @@ def is_scalar(value: Any) -> bool:
     return value is None or type(value) in (bool, float)
 
 
+def _is_same_scalar(a: Any, b: Any) -> bool:
+    return type(a) is type(b) and (repr(a) == repr(b) if type(a) is float else a == b)
+
+
 def head(node: dict[str, Any]) -> tuple[str, Any]:
     """:return: the kind of a captured value, and its content"""
     return next(iter(node.items()))
@@ -52,7 +56,7 @@ class Initial:
     What was there when training began.
 
     :param attributes: what was captured of those that can be left out, by path
-    :param shared: the paths of arrays that were parts of the same memory, each group as one text
+    :param shared: the paths of arrays that were parts of the same memory, and which parts, each group as one text
     """
 
     attributes: dict[str, Any]
@@ -78,7 +82,7 @@ class Capture:
         self._seen: dict[int, int] = {}
         self._alive: list[Any] = []
         self._memory: dict[int, int] = {}
-        self._parts: list[tuple[int, str]] = []  # the memory of every array, and its path
+        self._parts: list[tuple[int, str]] = []  # the memory of every array; its path and part of that
         self._depth = 0
 
     def capture(self, value: Any, path: str) -> Any:
@@ -143,13 +147,14 @@ class Capture:
         self.arrays.append(array)
         return {"#": len(self.arrays) - 1}
 
-    def note_memory(self, address: int | None, path: str) -> int:
+    def note_memory(self, address: int | None, path: str, part: Any) -> int:
         """
+        :param part: which part of the memory it is
         :param address: where the memory begins that an array is a part of; None if it has no numbers
         :return: the number of this memory
         """
         number = len(self._parts) if address is None else self._memory.setdefault(address, len(self._parts))
-        self._parts.append((number, path))
+        self._parts.append((number, path if part is None else f"{path} (part {part})"))
         return number
 
     def as_initial(self) -> Initial:
@@ -160,7 +165,7 @@ class Capture:
         """Note what shares its memory and did not when training began: it will not when the run is resumed."""
         if self.initial is not None:
             new = sorted(self.shared_memory() - self.initial.shared)
-            self.left_out += [f"{group} share their memory, and did not when training began" for group in new]
+            self.left_out += [f"{group} share their memory, and did not so when training began" for group in new]
 
     def shared_memory(self) -> set[str]:
         """:return: the paths of arrays that are parts of the same memory, each group as one text"""
@@ -206,7 +211,7 @@ class Restore:
         :raises NotRestoredError: if it does not fit
         """
         if not isinstance(node, dict):
-            return existing if type(existing) is type(node) and repr(existing) == repr(node) else node
+            return existing if _is_same_scalar(existing, node) else node
         tag, content = head(node)
         if tag == "known":
             return self.known[content]
