@@ -117,7 +117,8 @@ def _memory_of(context: Capture, array: Any, path: str) -> int:
     is_tensor = isinstance(array, th.Tensor)
     size = array.numel() if is_tensor else array.size
     address = array.untyped_storage().data_ptr() if is_tensor else _address(array)
-    return context.note_memory(address if size else None, path, None if is_tensor else _part(array))
+    part = [str(array.dtype), list(array.shape), None if is_tensor else _part(array)]
+    return context.note_memory(address if size else None, path, part)
 
 
 # ---------------------------------------------------------------- tensors

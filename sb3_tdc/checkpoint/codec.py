@@ -56,11 +56,11 @@ class Initial:
     What was there when training began.
 
     :param attributes: what was captured of those that can be left out, by path
-    :param shared: the paths of arrays that were parts of the same memory, and which parts, each group as one text
+    :param shared: the arrays that were parts of the same memory, each group as one text: how they are reached
     """
 
     attributes: dict[str, Any]
-    shared: set[str]
+    shared: dict[str, str]
 
 
 class Capture:
@@ -76,14 +76,14 @@ class Capture:
         self.left_out: list[str] = []
         self.attributes: dict[str, Any] = {}
         self.first_arrays: dict[str, int] = {}  # of attributes that come from a capture of their own
-        self.shared_elsewhere: set[str] = set()  # memory, in such captures
+        self.shared_elsewhere: dict[str, str] = {}  # memory, in such captures
         self.initial = initial
         self._known = {id(value): name for name, value in (known or {}).items()}
         self._seen: dict[int, int] = {}
         self._alive: list[Any] = []
         self._memory: dict[int, int] = {}
-        self._parts: list[tuple[int, str]] = []  # the memory of every array; its path and part of that
-        self._depth = 0
+        self._parts: list[tuple[int, str, str]] = []  # the memory of every array, its path, and how it is reached
+        self._trail: list[str] = []  # the classes of the values under way
 
     def capture(self, value: Any, path: str) -> Any:
         """
@@ -96,12 +96,12 @@ class Capture:
             return {"known": self._known[id(value)]}
         if id(value) in self._seen:
             return {"same": self._seen[id(value)]}
-        if self._depth == _DEEPEST:
+        if len(self._trail) == _DEEPEST:
             raise NotCapturedError(f"{path} is nested more than {_DEEPEST} deep")
         tag = next((tag for tag, kind in KINDS.items() if kind.matches(value)), None)
         if tag is None:
             raise NotCapturedError(f"{path} is a {name_of(type(value))}")
-        self._depth += 1
+        self._trail.append(name_of(type(value)))
         try:
             if not KINDS[tag].has_identity:
                 return {tag: KINDS[tag].capture(self, value, path)}
@@ -109,7 +109,7 @@ class Capture:
             self._alive.append(value)
             return {tag: KINDS[tag].capture(self, value, path), "id": number}
         finally:
-            self._depth -= 1
+            self._trail.pop()
 
     def capture_attributes(self, values: dict[str, Any], path: str, optional: bool = False) -> dict[str, Any]:
         """:param optional: leave out, and note, what cannot be captured or will not be restored"""
@@ -149,12 +149,12 @@ class Capture:
 
     def note_memory(self, address: int | None, path: str, part: Any) -> int:
         """
-        :param part: which part of the memory it is
+        :param part: which part of the memory it is, and of which shape and type
         :param address: where the memory begins that an array is a part of; None if it has no numbers
         :return: the number of this memory
         """
         number = len(self._parts) if address is None else self._memory.setdefault(address, len(self._parts))
-        self._parts.append((number, path if part is None else f"{path} (part {part})"))
+        self._parts.append((number, path, f"{path} {part} {' '.join(self._trail)}"))
         return number
 
     def as_initial(self) -> Initial:
@@ -164,15 +164,18 @@ class Capture:
     def tell_shared_memory(self) -> None:
         """Note what shares its memory and did not when training began: it will not when the run is resumed."""
         if self.initial is not None:
-            new = sorted(self.shared_memory() - self.initial.shared)
-            self.left_out += [f"{group} share their memory, and did not so when training began" for group in new]
+            new = [paths for group, paths in self.shared_memory().items() if group not in self.initial.shared]
+            self.left_out += [f"{paths} share their memory, and did not so when training began" for paths in new]
 
-    def shared_memory(self) -> set[str]:
-        """:return: the paths of arrays that are parts of the same memory, each group as one text"""
-        paths: dict[int, list[str]] = {}
-        for number, path in self._parts:
-            paths.setdefault(number, []).append(path)
-        return self.shared_elsewhere | {" and ".join(sorted(group)) for group in paths.values() if len(group) > 1}
+    def shared_memory(self) -> dict[str, str]:
+        """:return: the paths of arrays that are parts of the same memory, by how they are reached"""
+        groups: dict[int, list[tuple[str, str]]] = {}
+        for number, path, way in self._parts:
+            groups.setdefault(number, []).append((way, path))
+        shared = [sorted(group) for group in groups.values() if len(group) > 1]
+        return self.shared_elsewhere | {
+            "\n".join(way for way, _ in group): " and ".join(path for _, path in group) for group in shared
+        }
 
 
 class Restore:

@@ -52,7 +52,7 @@ def capture_env(env: gym.Env) -> dict[str, Any]:
     whole = context.capture_optional([env, *(monitor.env for monitor in monitors)], "env")
     why = context.left_out[-1] if whole is MISSING else None
     content["whole"] = whole if why is None else None
-    shared = sorted(context.shared_memory())
+    shared = context.shared_memory()
     return {"why": why, "content": content, "arrays": context.arrays, "left_out": context.left_out, "shared": shared}
 
 
@@ -164,7 +164,7 @@ def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
     else:
         why = f"{path} is a SubprocVecEnv: wrap its environments in sb3_tdc.checkpoint.Restorable (wrapper_class)"
         states = [
-            {"why": why, "content": None, "arrays": [], "left_out": [why], "shared": []} for _ in range(env.num_envs)
+            {"why": why, "content": None, "arrays": [], "left_out": [why], "shared": {}} for _ in range(env.num_envs)
         ]
     captured = []
     for i, state in enumerate(states):
@@ -177,7 +177,7 @@ def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
 
 def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str) -> None:
     context.left_out += state["left_out"]
-    context.shared_elsewhere |= {f"{path}: {group}" for group in state["shared"]}
+    context.shared_elsewhere |= {f"{path}: {group}": f"{path}: {paths}" for group, paths in state["shared"].items()}
     if state["why"] is not None:
         return
     whole = context.attributes[path] = state["content"]["whole"]

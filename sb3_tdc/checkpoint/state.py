@@ -104,7 +104,7 @@ def _restore_values(
     for node, value, path in ((parts["env"], model.env, "env"), (parts["callbacks"], callback, "callbacks")):
         if node is not None:
             context.restore(node, value, path)
-    context.restore_attributes(parts["logger"], model._logger, "logger", optional=True)
+    context.restore_attributes(parts["logger"], getattr(model, "_logger", None), "logger", optional=True)
 
 
 def restoring(

@@ -3,6 +3,10 @@
 import io
 import json
 import re
+import threading
+import time
+import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -12,8 +16,10 @@ from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from sb3_tdc.checkpoint import state
-from tests.checkpoint.values import BOXES, LEAVES, alike, build
+from sb3_tdc.checkpoint import Checkpoints, state
+from sb3_tdc.checkpoint.codec import KINDS
+from tests.checkpoint.runs import Stop, StopAt
+from tests.checkpoint.values import BOXES, LEAVES, Node, alike, build
 
 
 class Holds(BaseCallback):
@@ -87,7 +93,7 @@ recipes = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=100)
 @given(st.tuples(recipes, recipes), st.tuples(recipes, recipes))
 def test_whatever_a_callback_holds_comes_back_or_is_named(model, before, after):
     now, restored, named = there_and_back(model, before, after)
@@ -96,7 +102,8 @@ def test_whatever_a_callback_holds_comes_back_or_is_named(model, before, after):
         return
     original = build_both(before)
     for name, value, found, built in zip("xy", now, restored, original, strict=True):
-        if any(re.match(rf"callbacks\.callbacks\[0\]\.{name}\b", why) for why in named):
+        # What one attribute shares with the other may be reached by it alone
+        if any(re.match(rf"callbacks\.callbacks\[0\]\.{name}\b|.* share their memory", why) for why in named):
             continue
         assert alike(value, found), (named, built)
 
@@ -161,3 +168,133 @@ def test_what_will_not_come_back_is_named(model, before, after):
     if (before, after) != ("views", "no views"):  # three arrays, each its own again
         assert len(named) >= 1
         assert all(why.startswith("callbacks.callbacks[0].x") for why in named)
+
+
+# ---------------------------------------------------------------- in a run
+
+
+class Grows(BaseCallback):
+    """What it holds can be captured when training begins, and not from step 30 on."""
+
+    def __init__(self):
+        super().__init__()
+        self.notes, self.lock, self.count = [], None, 0
+
+    def _on_step(self):
+        self.count += 1
+        if self.num_timesteps == 30:
+            self.notes.append(Node(1))
+            self.lock = threading.Lock()
+        return True
+
+
+def run(folder, callback, stop_at=None, env=None):
+    model = make_model() if env is None else make_model_on(env)
+    checkpoints = Checkpoints(folder, freq=20, verbose=0)
+    try:
+        checkpoints.restore(model)
+        model.learn(100, callback=[checkpoints, callback, StopAt(stop_at)])
+    except Stop:
+        pass
+    finally:
+        checkpoints.store.close()
+    return checkpoints, model
+
+
+def test_what_cannot_be_captured_any_more_is_named_once_and_ends_nothing(tmp_path):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run(tmp_path, Grows(), stop_at=90)
+    named = [str(warning.message) for warning in caught if "Not in the checkpoints" in str(warning.message)]
+    where = "Not in the checkpoints: callbacks.callbacks[1]"
+    assert named == [
+        f"{where}.notes[0] is a tests.checkpoint.values.Node, which was not there when training began",
+        f"{where}.lock is a _thread.lock",
+    ]
+    grows = Grows()
+    run(tmp_path, grows)
+    assert (grows.count, grows.notes, grows.lock) == (100, [], None)  # as built, but for what can be captured
+
+
+def test_a_usual_run_has_nothing_to_name_and_verifies_in_no_time(tmp_path):
+    """Its files are left alone: they are not restored when training begins."""
+    model = SAC("MlpPolicy", "HalfCheetah-v5", seed=1, device="cpu", learning_starts=10, buffer_size=200_000)
+    checkpoints = Checkpoints(tmp_path, freq=20, verbose=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(50, callback=checkpoints)
+        start = time.perf_counter()
+        assert checkpoints.verify(model) == []
+        assert time.perf_counter() - start < 0.5
+    checkpoints.store.close()
+
+
+def test_verify_can_be_called_before_training(tmp_path):
+    model = make_model()
+    model.lock = threading.Lock()
+    checkpoints = Checkpoints(tmp_path, verbose=0)
+    assert checkpoints.verify(model) == ["model.lock is a _thread.lock"]
+    checkpoints.store.close()
+
+
+def test_verify_compares_without_the_code_that_restores(model, monkeypatch):
+    """A kind whose restoring is broken is noticed, whatever it is."""
+    holds = Holds(bytearray(b"ab"), [1, 2])
+    monkeypatch.setattr(KINDS["bytearray"], "restore", lambda context, content, existing, path: existing + b"c")
+    names, _ = state.verify(model, CallbackList([holds]))
+    assert "callbacks.callbacks[0].x does not come back as it was" in names
+    assert not any(name.startswith("callbacks.callbacks[0].y") for name in names)
+
+
+class Draws(Still):
+    """An environment whose restore fails: its object is of another class in the second process."""
+
+    kind = Node
+
+    def __init__(self):
+        self.part, self.drawn = self.kind(), []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 1).astype(np.float32), {}
+
+    def step(self, action):
+        self.drawn.append(self.np_random.uniform())
+        return np.zeros(1, np.float32), self.drawn[-1], False, False, {}
+
+
+def make_model_on(env):
+    small = {"policy_kwargs": {"net_arch": [2]}, "buffer_size": 200, "learning_starts": 100, "device": "cpu"}
+    return SAC("MlpPolicy", env, seed=1, **small)
+
+
+def test_an_environment_whose_restore_fails_does_not_repeat_its_draws(tmp_path, monkeypatch):
+    first = Draws()
+    run(tmp_path, Holds(1, 2), stop_at=45, env=first)
+    monkeypatch.setattr(Draws, "kind", type("Other", (Node,), {}))
+    second = Draws()
+    with pytest.warns(RuntimeWarning, match=r"with new episodes.*part was a .*Node, and is a .*Other"):
+        run(tmp_path, Holds(1, 2), env=second)
+    assert not set(first.drawn[:40]) & set(second.drawn[-60:])
+
+
+def test_an_attribute_whose_restore_fails_stays_as_built_and_the_others_do_not(tmp_path):
+    run(tmp_path, Holds(Node([1]), 5), stop_at=45)
+    holds = Holds([7], 6)
+    with pytest.warns(
+        RuntimeWarning, match=r"Not restored: callbacks\.callbacks\[1\]\.x was a .*Node, and is a .*list"
+    ):
+        run(tmp_path, holds)
+    assert (holds.x, holds.y) == ([7], 5)
+
+
+def test_a_path_in_the_folder_moves_with_it_and_others_stay(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    paths = [Path("run/notes.txt"), tmp_path / "run" / "notes.txt", Path("other/notes.txt")]
+    run(Path("run/checkpoints"), Holds(paths, None), stop_at=45)
+    (tmp_path / "run").rename(tmp_path / "moved")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    holds = Holds([], None)
+    run(Path("../moved/checkpoints"), holds)
+    assert holds.x == [Path("../moved/notes.txt"), Path("../moved/notes.txt"), Path("other/notes.txt")]
