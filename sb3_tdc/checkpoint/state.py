@@ -127,13 +127,8 @@ def verify(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[list[str]
     after = capture_state(model, callback, before.as_initial())[1]
     _set_random_state(context.restore(parts["random"], MISSING, "random"))
     differing = [f"{path} does not come back as it was" for path in differences(before, after)]
-    return [
-        *before.left_out,
-        *context.not_restored,
-        *context.restarted,
-        *differing,
-        *after.left_out,
-    ], before.as_initial()
+    names = [*before.left_out, *context.not_restored, *context.restarted, *differing, *after.left_out]
+    return list(dict.fromkeys(names)), before.as_initial()
 
 
 def _known(model: OffPolicyAlgorithm) -> dict[str, Any]:
