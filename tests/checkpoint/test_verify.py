@@ -298,3 +298,23 @@ def test_a_path_in_the_folder_moves_with_it_and_others_stay(tmp_path, monkeypatc
     holds = Holds([], None)
     run(Path("../moved/checkpoints"), holds)
     assert holds.x == [Path("../moved/notes.txt"), Path("../moved/notes.txt"), Path("other/notes.txt")]
+
+
+@pytest.mark.parametrize(
+    ("one", "apart"),
+    [
+        ("array", "other array"),
+        ("generator", "other generator"),
+        ("missing lists", ("list", [])),
+        ("tensor", "parameter"),
+    ],
+)
+def test_what_was_one_and_is_two_now_does_not_become_one_again(model, one, apart):
+    now, restored, named = there_and_back(model, (one, ("same", 0)), (one, apart))
+    assert (alike(now, restored), named) == (True, [])
+
+
+def test_arrays_that_no_longer_share_their_memory_do_not_write_into_each_other(model):
+    before, after = ("views", "None"), ("other arrays of these shapes", "None")
+    now, restored, named = there_and_back(model, before, after)
+    assert (alike(now, restored), named) == (True, [])

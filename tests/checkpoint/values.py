@@ -112,6 +112,7 @@ LEAVES: dict[str, Any] = {
     "views": lambda: [(whole := np.arange(10.0)), whole[2:5], whole[::-1]],
     "shifted views": lambda: [(whole := np.arange(10.0)), whole[3:6], whole[::-1]],
     "no views": lambda: [np.arange(10.0), np.arange(3.0), np.arange(10.0)],
+    "other arrays of these shapes": lambda: [np.ones(10), np.arange(20.0)[2:5], np.arange(10.0)[::-1]],
     "long floats": lambda: [0.5] * 70,
     "long integers": lambda: [2**70, -1] * 40,
     "long unsigned": lambda: [2**63, -1] * 40,
