@@ -36,7 +36,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_tdc.busy_machine import BusyMachine
-from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable
+from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable, stored_steps
 from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.finite_guard import FiniteGuard, check_weights, divergence_named
 from sb3_tdc.hyperparams import Hyperparams
@@ -64,7 +64,7 @@ class Experiment:
     :param from_step: go on from the checkpoint of this step instead
     :param changed: hyperparameters that are others from there on
     :param tensorboard_log: "" for none; None for the run's own folder
-    :param trained_model: a zip to go on from; its replay buffer and normalisation are loaded if they lie beside it
+    :param trained_model: a zip to start from; its replay buffer and normalisation are loaded if they lie next to it
     :param trust: whether ``trained_model`` and what lies beside it may run code, as SB3's ``load`` lets them
     :param log_interval: episodes between log entries; None for none
     """
@@ -185,6 +185,11 @@ def make_envs(
     return env
 
 
+def _has_state(experiment: Experiment) -> bool:
+    """Return whether there is a state to resume from: it has more than lies next to a trained model."""
+    return experiment.resume and bool(stored_steps(experiment.folder.checkpoint_folder))
+
+
 def train(experiment: Experiment) -> Outcome:
     """
     Train from the first step to the last, or to Ctrl-C; either way the model is saved (after a second one, it is not).
@@ -274,7 +279,7 @@ def _choose_checkpoint(experiment: Experiment, checkpoints: Checkpoints, model: 
 
 def _make_training_envs(experiment: Experiment) -> VecEnv:
     normalization = None
-    if experiment.trained_model is not None:
+    if experiment.trained_model is not None and not _has_state(experiment):
         run = RunFolder(experiment.trained_model.parent, experiment.folder.env_name)
         normalization = run.normalization(experiment.trained_model)
         if not normalization.exists():
@@ -321,6 +326,8 @@ def _make_model(experiment: Experiment, env: VecEnv) -> OffPolicyAlgorithm:
     for of_the_saved_model in ("policy", "policy_kwargs"):
         kwargs.pop(of_the_saved_model, None)
     model = load_model(experiment.trained_model, experiment.algo, env, experiment.trust, **kwargs)
+    if _has_state(experiment):
+        return model
     run = RunFolder(experiment.trained_model.parent, experiment.folder.env_name)
     replay_buffer = run.replay_buffer(experiment.trained_model)
     if replay_buffer.exists():

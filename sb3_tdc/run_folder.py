@@ -82,6 +82,11 @@ class RunFolder:
         return self.path / "best_model.zip"
 
     @property
+    def trained_agent(self) -> Path:
+        """A copy of the model that the run started from: its networks, if the original has moved when it is resumed."""
+        return self.path / self.env_name / "trained_agent.zip"
+
+    @property
     def config(self) -> dict[str, Any]:
         """The hyperparameters as they were read."""
         return _read_yaml(self.path / self.env_name / "config.yml")

@@ -1,7 +1,9 @@
 """``python train.py --algo tdc --env Walker2d-v4``: arguments and messages; the run itself is in ``experiment``."""
 
 import argparse
+import os
 import shlex
+import shutil
 import sys
 import textwrap
 import time
@@ -94,10 +96,34 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
     if args.seed < 0:
         args.seed = int(np.random.randint(2**31 - 1))
     hyperparams = read_hyperparams(args)
-
-    folder = RunFolder.create(args.log_folder, args.algo, args.env, args.uuid)
-    folder.write_config(hyperparams.raw, plain_arguments(vars(args)))
+    vars(args).update(_absolute(vars(args)))
+    folder = _make_folder(args, hyperparams)
     return _experiment(args, hyperparams, folder)
+
+
+def _make_folder(args: argparse.Namespace, hyperparams: Hyperparams) -> RunFolder:
+    """
+    Make the run folder, with everything that the run is resumed from.
+
+    :raises ValueError: if it cannot be written; nothing of it stays
+    """
+    folder = None
+    try:
+        folder = RunFolder.create(args.log_folder, args.algo, args.env, args.uuid)
+        folder.write_config(hyperparams.raw, plain_arguments(vars(args)))
+        if args.trained_agent is not None:
+            shutil.copyfile(args.trained_agent, folder.trained_agent)
+    except OSError as error:
+        if folder is not None:
+            shutil.rmtree(folder.path, ignore_errors=True)
+        raise ValueError(f"No run folder can be made in {args.log_folder}: {error}") from error
+    return folder
+
+
+def _absolute(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the locations among arguments as they are found from any working directory."""
+    locations = {name: arguments[name] for name in ("trained_agent", "tensorboard_log") if arguments.get(name)}
+    return {name: type(location)(os.path.abspath(location)) for name, location in locations.items()}
 
 
 def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experiment | None:
@@ -112,6 +138,7 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
     if not (folder.path / folder.env_name / "args.yml").is_file():
         raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
     stored = folder.args
+    given = {**given, **_absolute(given)}
     for name, value in plain_arguments(given).items():
         if name not in (*_OF_THE_PROCESS, *_OF_RESUMING) and value != stored.get(name, value):
             flag = f"--{name.replace('_', '-')}"
@@ -123,7 +150,9 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
         return None
     if stored.get("checkpoint_freq", 0) <= 0:
         raise ValueError(f"{folder.path} has no checkpoints: it was made without --checkpoint-freq")
-    args.trained_agent = Path(args.trained_agent) if args.trained_agent is not None else None
+    if args.trained_agent is not None:
+        has_state = bool(stored_steps(folder.checkpoint_folder))
+        args.trained_agent = folder.trained_agent if has_state else Path(args.trained_agent)
     apply_common_arguments(args, args.env)
     check_env_id(args.env)
     where, config = str(folder.path / folder.env_name / "config.yml"), folder.config

@@ -66,11 +66,13 @@ def test_a_run_leaves_what_rl_zoo_leaves(tmp_path, capsys):
         *(f"rl_model_replay_buffer_{n}_steps.pkl" for n in (100, 200, 300)),
     }  # fmt: skip
     assert {path.name for path in (folder / "Hopper-v4").iterdir()} == {
-        "args.yml", "command.txt", "config.yml", "finished.yml",
+        "args.yml", "command.txt", "config.yml", "finished.yml", "versions.yml",
     }  # fmt: skip
     config = yaml.safe_load((folder / "Hopper-v4" / "config.yml").read_text())
     assert (config["lam"], config["n_timesteps"], config["learning_starts"]) == (0.9, 300, 100)
     assert yaml.safe_load((folder / "Hopper-v4" / "args.yml").read_text())["seed"] == 1
+    versions = yaml.safe_load((folder / "Hopper-v4" / "versions.yml").read_text())
+    assert versions["mujoco"] == importlib.metadata.version("mujoco")
     with np.load(folder / "evaluations.npz") as evaluations:
         assert evaluations["timesteps"].tolist() == [150, 300]
         assert evaluations["results"].shape == (2, 2)

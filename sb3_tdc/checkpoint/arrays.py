@@ -247,7 +247,9 @@ def restore_made(context: Restore, content: Any, existing: Any, path: str) -> An
     """:return: the value"""
     name, parts = content
     if issubclass(_MADE[name][0], pathlib.Path):
-        return _MADE[name][2](context.relocate(context.restore(parts[0], MISSING, path)))
+        text = context.restore(parts[0], MISSING, path)
+        there = str(existing) if isinstance(existing, pathlib.PurePath) else MISSING
+        return _MADE[name][2](context.locations.find(text, there, f"{path}[0]", is_path=True))
     return _MADE[name][2](*restore_items(context, parts, [], path))
 
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_tdc.checkpoint import replay, state
 from sb3_tdc.checkpoint.codec import Initial, NotRestoredError
+from sb3_tdc.checkpoint.locations import Locations
 from sb3_tdc.checkpoint.store import Store, Stored
 from sb3_tdc.tdc.diagnostics import NonFiniteError
 
@@ -130,7 +131,8 @@ class Checkpoints(BaseCallback):
         state.restore_weights(model, weights)
         with np.load(stored.path / "arrays.npz", allow_pickle=False) as arrays:
             numbered = [arrays[str(i)] for i in range(len(arrays.files))]
-        context = state.restoring(model, numbered, stored.step, self._relocation(parts["origin"]))
+        locations = Locations.restore(parts["locations"], self.store.folder.parent)
+        context = state.restoring(model, numbered, stored.step, locations)
         state.restore_state(model, self.root, parts["state"], context, self._changed)
         restarted = [why for why in context.restarted if why.startswith("env")]
         for why in (*context.not_restored, *(why for why in context.restarted if why not in restarted)):
@@ -212,6 +214,7 @@ class Checkpoints(BaseCallback):
 
     def _write(self, step: int) -> None:
         model: Any = self.model
+        assert self._initial is not None
         _refuse_non_finite(step, state.find_non_finite(model))
         parts, context = state.capture_state(model, self.root, self._initial)
         self._tell(context.left_out)
@@ -219,7 +222,7 @@ class Checkpoints(BaseCallback):
         files = [*self.files, *state.files_of_evaluations(self.root)]
         content = {
             "run": state.describe_run(model),
-            "origin": {"working directory": os.getcwd(), "folder": os.path.abspath(self.store.folder.parent)},
+            "locations": Locations.capture(self.store.folder.parent, self._initial.texts),
             "platform": state.describe_platform(model),
             "state": parts,
             "segments": [asdict(segment) for segment in segments],
@@ -268,17 +271,6 @@ class Checkpoints(BaseCallback):
             shutil.copyfile(file, path)
 
         return copy
-
-    def _relocation(self, origin: dict[str, str]) -> Callable[[str], str]:
-        """:return: what finds a path of the folder that held the checkpoints in the one that holds them now"""
-
-        def relocate(path: str) -> str:
-            then = Path(os.path.normpath(Path(origin["working directory"], path)))
-            if not then.is_relative_to(origin["folder"]):
-                return path
-            return str(self.store.folder.parent / then.relative_to(origin["folder"]))
-
-        return relocate
 
     def _put_files_back(self, stored: Stored, saved: list[str | None]) -> None:
         files = [*self.files, *state.files_of_evaluations(self.root)]

@@ -19,6 +19,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import nn
 
+from sb3_tdc.checkpoint.locations import UNMOVED, Locations
+
 MISSING: Any = object()
 # Deeper nesting could be captured, but not restored within Python's limit of recursion
 _DEEPEST = 100
@@ -57,10 +59,12 @@ class Initial:
 
     :param attributes: what was captured of those that can be left out, by path
     :param shared: the arrays that were parts of the same memory, each group as one text: how they are reached
+    :param texts: all texts by path, since some of them are locations
     """
 
     attributes: dict[str, Any]
     shared: dict[str, str]
+    texts: dict[str, str]
 
 
 class Capture:
@@ -75,6 +79,7 @@ class Capture:
         self.arrays: list[np.ndarray] = []
         self.left_out: list[str] = []
         self.attributes: dict[str, Any] = {}
+        self.texts: dict[str, str] = {}  # those that the objects were built with
         self.first_arrays: dict[str, int] = {}  # of attributes that come from a capture of their own
         self.shared_elsewhere: dict[str, str] = {}  # memory, in such captures
         self.initial = initial
@@ -91,6 +96,8 @@ class Capture:
         :raises NotCapturedError: for what cannot be captured
         """
         if is_scalar(value):
+            if type(value) is str and self.initial is None:
+                self.texts[path] = value
             return value
         if id(value) in self._known:
             return {"known": self._known[id(value)]}
@@ -159,7 +166,7 @@ class Capture:
 
     def as_initial(self) -> Initial:
         """:return: what later captures are compared with"""
-        return Initial(self.attributes, self.shared_memory())
+        return Initial(self.attributes, self.shared_memory(), self.texts)
 
     def tell_shared_memory(self) -> None:
         """Note what shares its memory and did not when training began: it will not when the run is resumed."""
@@ -186,7 +193,7 @@ class Restore:
     :param known: as there
     :param step: the timestep of the capture
     :param with_files: restore files too
-    :param relocate: where a path of then is now
+    :param locations: where the run's files were, and are now
     """
 
     def __init__(
@@ -195,9 +202,9 @@ class Restore:
         known: dict[str, Any] | None = None,
         step: int = 0,
         with_files: bool = True,
-        relocate: Callable[[str], str] = str,
+        locations: Locations = UNMOVED,
     ):
-        self.known, self.step, self.with_files, self.relocate = known or {}, step, with_files, relocate
+        self.known, self.step, self.with_files, self.locations = known or {}, step, with_files, locations
         self.restarted: list[str] = []
         self.not_restored: list[str] = []
         self._arrays = arrays
@@ -214,6 +221,7 @@ class Restore:
         :raises NotRestoredError: if it does not fit
         """
         if not isinstance(node, dict):
+            node = self.locations.find(node, existing, path) if type(node) is str else node
             return existing if _is_same_scalar(existing, node) else node
         tag, content = head(node)
         if tag == "known":

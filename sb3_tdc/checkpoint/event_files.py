@@ -1,11 +1,14 @@
 """TensorBoard's event files: cut back to where they were, and continued in a new one without a gap or a duplicate."""
 
 import os
+import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+from sb3_tdc.checkpoint.locations import Locations
 
 
 def capture_event_files(output: TensorBoardOutputFormat) -> dict[str, Any]:
@@ -17,31 +20,41 @@ def capture_event_files(output: TensorBoardOutputFormat) -> dict[str, Any]:
         with path.open("rb") as file:
             os.fsync(file.fileno())
         sizes[path.name] = path.stat().st_size
-    return {"folder": str(folder.resolve()), "sizes": sizes}
+    return {"folder": os.path.abspath(folder), "sizes": sizes}
 
 
-def restore_event_files(output: TensorBoardOutputFormat, state: dict[str, Any], step: int) -> None:
+def restore_event_files(
+    output: TensorBoardOutputFormat, state: dict[str, Any], step: int, locations: Locations
+) -> None:
     """
-    What this process has written so far is dropped, and what was written after the state was captured.
+    Drop what this process has written so far, and what was written after the state was captured.
+
+    The files stay in their folder. If that is outside the run's folder and this run is a copy, it belongs to the
+    original: the copy continues with copies of the files, in the folder that was made for this process.
 
     :param step: a TensorBoard that watches is told to forget what it has seen beyond
     """
     from torch.utils.tensorboard.writer import SummaryWriter
 
     output.writer.close()
-    opened, folder = Path(output.writer.log_dir).resolve(), Path(state["folder"])
-    if not folder.is_dir():  # the run was moved
+    opened, folder = Path(output.writer.log_dir), Path(state["folder"])
+    if not folder.is_dir():
         folder = opened
+    if not folder.samefile(opened):  # made for this process
+        for path in _event_files(opened):
+            path.unlink()
+        if locations.is_copy and not locations.contains(folder):
+            for name in state["sizes"]:
+                shutil.copy2(folder / name, opened / name)
+            folder = opened
+        else:
+            with suppress(OSError):
+                opened.rmdir()
     for path in _event_files(folder):
         if path.name not in state["sizes"]:
             path.unlink()
         elif path.stat().st_size > state["sizes"][path.name]:
             os.truncate(path, state["sizes"][path.name])
-    if opened != folder:  # made for this process
-        for path in _event_files(opened):
-            path.unlink()
-        with suppress(OSError):
-            opened.rmdir()
     output.writer = SummaryWriter(str(folder), purge_step=step + 1)
 
 

@@ -20,6 +20,7 @@ from sb3_tdc.checkpoint.codec import (
 )
 from sb3_tdc.checkpoint.event_files import capture_event_files, restore_event_files
 from sb3_tdc.checkpoint.generators import GENERATORS
+from sb3_tdc.checkpoint.locations import Locations
 
 
 class Restorable(gym.Wrapper):
@@ -29,9 +30,9 @@ class Restorable(gym.Wrapper):
         """:return: of :func:`capture_env`"""
         return capture_env(self)
 
-    def restore_state(self, state: dict[str, Any], with_files: bool = True) -> str | None:
+    def restore_state(self, state: dict[str, Any], with_files: bool, locations: Locations) -> str | None:
         """:return: of :func:`restore_env`"""
-        return restore_env(self, state, with_files)
+        return restore_env(self, state, with_files, locations)
 
 
 def capture_env(env: gym.Env) -> dict[str, Any]:
@@ -53,18 +54,26 @@ def capture_env(env: gym.Env) -> dict[str, Any]:
     why = context.left_out[-1] if whole is MISSING else None
     content["whole"] = whole if why is None else None
     shared = context.shared_memory()
-    return {"why": why, "content": content, "arrays": context.arrays, "left_out": context.left_out, "shared": shared}
+    return {
+        "why": why,
+        "content": content,
+        "arrays": context.arrays,
+        "left_out": context.left_out,
+        "shared": shared,
+        "texts": context.texts,
+    }
 
 
-def restore_env(env: gym.Env, state: dict[str, Any], with_files: bool = True) -> str | None:
+def restore_env(env: gym.Env, state: dict[str, Any], with_files: bool, locations: Locations) -> str | None:
     """
     :param with_files: restore files too
+    :param locations: with the texts that this environment was built with
     :return: None, or why the episode has to be started again
     """
     if state["content"] is None:
         return state["why"]
     monitors = _monitors(env)
-    context = Restore(state["arrays"], _known(monitors), with_files=with_files)
+    context = Restore(state["arrays"], _known(monitors), with_files=with_files, locations=locations)
     for name, owner in _owners(env).items():
         nodes = state["content"]["generators"].get(name, {})
         context.restore_attributes(nodes, owner, name, optional=True)
@@ -163,9 +172,15 @@ def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
         states = env.env_method("capture_state")
     else:
         why = f"{path} is a SubprocVecEnv: wrap its environments in sb3_tdc.checkpoint.Restorable (wrapper_class)"
-        states = [
-            {"why": why, "content": None, "arrays": [], "left_out": [why], "shared": {}} for _ in range(env.num_envs)
-        ]
+        nothing: dict[str, Any] = {
+            "why": why,
+            "content": None,
+            "arrays": [],
+            "left_out": [why],
+            "shared": {},
+            "texts": {},
+        }
+        states = [nothing] * env.num_envs
     captured = []
     for i, state in enumerate(states):
         context.first_arrays[f"{path}, environment {i}"] = len(context.arrays)
@@ -177,6 +192,7 @@ def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
 
 def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str) -> None:
     context.left_out += state["left_out"]
+    context.texts |= {f"{path}: {name}": text for name, text in state["texts"].items()}
     context.shared_elsewhere |= {f"{path}: {group}": f"{path}: {paths}" for group, paths in state["shared"].items()}
     if state["why"] is not None:
         return
@@ -193,11 +209,12 @@ def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) ->
     if len(captured) != env.num_envs:
         raise NotRestoredError(f"{path} had {len(captured)} environments, and has {env.num_envs}")
     states = [{**state, "arrays": [context.array(number) for number in state["arrays"]]} for state in captured]
+    built = [context.locations.below(f"{path}, environment {i}: ") for i in range(len(states))]
+    arguments = [(state, context.with_files, locations) for state, locations in zip(states, built, strict=True)]
     if isinstance(env, DummyVecEnv):
-        whys = [restore_env(single, state, context.with_files) for single, state in zip(env.envs, states, strict=True)]
+        whys = [restore_env(single, *each) for single, each in zip(env.envs, arguments, strict=True)]
     elif env.has_attr("restore_state"):
-        arguments = [(state, context.with_files) for state in states]
-        whys = [env.env_method("restore_state", *both, indices=i)[0] for i, both in enumerate(arguments)]
+        whys = [env.env_method("restore_state", *each, indices=i)[0] for i, each in enumerate(arguments)]
     else:
         whys = [state["why"] or "there is no sb3_tdc.checkpoint.Restorable around it" for state in states]
     context.restarted += [f"{path}, environment {i}: {why}" for i, why in enumerate(whys) if why is not None]
@@ -220,7 +237,7 @@ def restore_output(context: Restore, content: Any, existing: Any, path: str) -> 
     output = existing_as(TensorBoardOutputFormat, existing, path)
     state = context.restore(content, MISSING, path)
     if context.with_files:
-        restore_event_files(output, state, context.step)
+        restore_event_files(output, state, context.step, context.locations)
     return output
 
 

@@ -4,7 +4,7 @@ import json
 import platform
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_tdc.checkpoint import kinds  # noqa: F401  # the table that all of this goes by
 from sb3_tdc.checkpoint.codec import MISSING, Capture, Initial, NotRestoredError, Restore, name_of
 from sb3_tdc.checkpoint.compare import differences
+from sb3_tdc.checkpoint.locations import UNMOVED, Locations
 from sb3_tdc.checkpoint.replay import other_attributes
 from sb3_tdc.tdc.checks import find_non_finite as find_non_finite_weights
 from sb3_tdc.versions import library_versions
@@ -108,10 +109,10 @@ def _restore_values(
 
 
 def restoring(
-    model: OffPolicyAlgorithm, arrays: list[np.ndarray], step: int = 0, relocate: Callable[[str], str] = str
+    model: OffPolicyAlgorithm, arrays: list[np.ndarray], step: int = 0, locations: Locations = UNMOVED
 ) -> Restore:
     """:return: the context for :func:`restore_state`"""
-    return Restore(arrays, _known(model), step, relocate=relocate)
+    return Restore(arrays, _known(model), step, locations=locations)
 
 
 def verify(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[list[str], Initial]:
