@@ -40,7 +40,7 @@ from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable, stored_ste
 from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.finite_guard import FiniteGuard, check_weights, divergence_named
 from sb3_tdc.hyperparams import Hyperparams
-from sb3_tdc.interruption import StopOnSignal, ignore_interrupts
+from sb3_tdc.interruption import StopOnSignal, ended_processes, ignore_signals
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, save
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely, read_data
@@ -62,6 +62,7 @@ class Experiment:
     :param checkpoint_freq: environment steps between checkpoints to resume from; 0 or less: none
     :param resume: go on from the newest checkpoint in the folder
     :param from_step: go on from the checkpoint of this step instead
+    :param start_over: remove these checkpoints first
     :param changed: hyperparameters that are others from there on
     :param tensorboard_log: "" for none; None for the run's own folder
     :param trained_model: a zip to start from; its replay buffer and normalisation are loaded if they lie next to it
@@ -82,6 +83,7 @@ class Experiment:
     checkpoint_freq: int = DEFAULT_FREQ
     resume: bool = False
     from_step: int | None = None
+    start_over: bool = False
     changed: tuple[str, ...] = ()
     vec_env: str = "dummy"
     device: str = "auto"
@@ -93,6 +95,10 @@ class Experiment:
     log_interval: int | None = 4
     progress_bar: bool = False
     verbose: int = 1
+
+
+class NotSavedError(Exception):
+    """A trained model that cannot be written, with the reason in one sentence."""
 
 
 class SetupError(ValueError):
@@ -155,7 +161,7 @@ def make_envs(
 
     def make_env(**kwargs: Any) -> gym.Env:  # Monitor comes around it: it must see the ends of the wrapped episodes
         if vec_env == "subproc":
-            ignore_interrupts()
+            ignore_signals()
         env = spec.make(**kwargs)
         for wrapper in hyperparams.env_wrapper:
             env = wrapper(env)
@@ -196,8 +202,10 @@ def train(experiment: Experiment) -> Outcome:
 
     :raises SetupError: if the run cannot begin; its folder is removed, if it was made for it
     :raises NonFiniteError: if training diverged; saved models stay as they are
+    :raises NotSavedError: if the trained model cannot be written
+    :raises LockedError: if another process has begun to write to the folder
     """
-    with ExitStack() as stack:
+    with ended_processes(), ExitStack() as stack:
         try:
             if experiment.trained_model is not None:
                 check_saved_by(experiment.trained_model, experiment.algo)
@@ -259,8 +267,11 @@ def _open_checkpoints(experiment: Experiment) -> Checkpoints | None:
         folder.checkpoint_folder,
         experiment.checkpoint_freq,
         files=of_evaluations if experiment.eval_freq > 0 else [],
+        hyperparams=experiment.hyperparams.raw,
         verbose=experiment.verbose,
     )
+    if experiment.start_over:
+        checkpoints.store.clear()
     if experiment.resume and not checkpoints.store.steps():  # stopped before its first step
         for events in folder.path.glob("events.out.tfevents.*"):
             events.unlink()
@@ -427,9 +438,13 @@ def _make_callbacks(
 
 def _save(experiment: Experiment, model: OffPolicyAlgorithm) -> None:
     folder = experiment.folder
-    _save_model(model, folder, folder.model)
-    if experiment.save_replay_buffer:
-        save(model.save_replay_buffer, folder.replay_buffer(folder.model))
+    try:
+        _save_model(model, folder, folder.model)
+        if experiment.save_replay_buffer:
+            save(model.save_replay_buffer, folder.replay_buffer(folder.model))
+    except _DISK_ERRORS as error:
+        reason = " ".join(str(error).split())
+        raise NotSavedError(f"The model of step {model.num_timesteps:,} could not be saved: {reason}") from error
 
 
 def _save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:

@@ -1,13 +1,19 @@
 """Ctrl-C and a polite kill: training ends after the step under way, with everything consistent."""
 
+import inspect
+import multiprocessing
 import signal
 import threading
 import time
+import traceback
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.checkpoint import Checkpoints
@@ -17,13 +23,16 @@ from sb3_tdc.output import write_from_handler
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 # How long a rollout may take to its end, where a checkpoint can be written
 _PATIENCE_SECONDS = 5.0
+# Who presses Ctrl-C twice takes longer; who signals a process and its group (timeout) does not
+_ONE_SIGNAL_SECONDS = 0.2
 
 
 class StopOnSignal(BaseCallback):
     """
-    As a context, it takes SIGINT, SIGTERM and SIGHUP; as a callback, it ends training after one. A second interrupts.
+    As a context, take SIGINT, SIGTERM and SIGHUP; as a callback, end training after one. A second Ctrl-C interrupts.
 
-    An exception raised by a handler, anywhere, could leave a step of processes half received or a file half written.
+    SIGTERM and SIGHUP may come several times, to the process and to its group: they never cost the state. An exception
+    raised by a handler, anywhere, could leave a step of processes half received or a file half written.
 
     :param checkpoints: write one first, when the next rollout starts, if that is soon
     """
@@ -32,7 +41,7 @@ class StopOnSignal(BaseCallback):
 
     def __init__(self, checkpoints: Checkpoints | None = None) -> None:
         super().__init__()
-        self.requested = False
+        self.requested, self.requested_at = False, 0.0
         self.checkpoints = checkpoints
         self.deadline = 0.0
         if checkpoints is not None:
@@ -53,15 +62,18 @@ class StopOnSignal(BaseCallback):
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
         if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-        self.deadline = time.monotonic() + _PATIENCE_SECONDS
-        write_from_handler("\nStopping after this step; once more to stop without saving.\n")
+            if number == signal.SIGINT and now > self.requested_at + _ONE_SIGNAL_SECONDS:
+                raise KeyboardInterrupt
+            return
+        self.requested, self.requested_at = True, now
+        self.deadline = now + _PATIENCE_SECONDS
+        write_from_handler("\nStopping after this step; Ctrl-C once more to stop without saving.\n")
 
     def _on_rollout_start(self) -> None:
-        if self.requested and self.checkpoints is not None and self.checkpoints.last_step == self.model.num_timesteps:
-            self.deadline = 0.0  # it is written
+        if self.requested and self.checkpoints is not None and self.checkpoints.last_try == self.model.num_timesteps:
+            self.deadline = 0.0  # it is written, or cannot be
 
     def _on_step(self) -> bool:
         return not self.requested or (self.checkpoints is not None and time.monotonic() < self.deadline)
@@ -89,15 +101,37 @@ class StoppableEvaluation(EvalCallback):
             return super()._on_step()
         except _EvaluationStoppedError:
             return False
-        except OSError as error:  # a full disk
+        except OSError as error:
+            if _is_raised_in(error, evaluate_policy):  # by the environment
+                raise
             warnings.warn(f"The evaluation of step {self.num_timesteps:,} was not written: {error}", stacklevel=2)
             return True
+
+
+def _is_raised_in(error: Exception, function: Callable) -> bool:
+    """Return whether an exception came out of a call of a function."""
+    code = inspect.unwrap(function).__code__
+    return any(frame.f_code is code for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
 class _EvaluationStoppedError(Exception):
     """Never leaves this module."""
 
 
-def ignore_interrupts() -> None:
-    """For processes of environments: a Ctrl-C in the terminal reaches them too, but the trainer ends them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def ignore_signals() -> None:
+    """For processes of environments: a signal to the whole group reaches them too, but the trainer needs them."""
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def ended_processes() -> Iterator[None]:
+    """Kill what processes of environments were started in this block and still run after it: they ignore all else."""
+    before = set(multiprocessing.active_children())
+    try:
+        yield
+    finally:
+        for process in set(multiprocessing.active_children()) - before:
+            if process.daemon:
+                process.kill()
+                process.join()

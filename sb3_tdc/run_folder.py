@@ -106,6 +106,13 @@ class RunFolder:
         return f"python train.py --resume {shlex.quote(str(self.path))}"
 
     @property
+    def has_results(self) -> bool:
+        """Whether something would be overwritten if the run began at step 0 again."""
+        logs = {self.path / "progress.csv": 1, **dict.fromkeys(self.path.glob("*monitor.csv"), 2)}  # lines of a header
+        has_rows = any(log.is_file() and log.read_bytes().count(b"\n") > header for log, header in logs.items())
+        return has_rows or any(self.path.glob("*.zip")) or (self.path / "evaluations.npz").is_file()
+
+    @property
     def is_finished(self) -> bool:
         return self._finished.is_file()
 

@@ -17,8 +17,8 @@ import yaml
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments, plain_arguments
-from sb3_tdc.checkpoint import DEFAULT_FREQ, NotRestoredError, stored_steps
-from sb3_tdc.experiment import ALGORITHMS, Experiment, Outcome, SetupError, check_env_id, train
+from sb3_tdc.checkpoint import DEFAULT_FREQ, LockedError, NotRestoredError, stored_steps
+from sb3_tdc.experiment import ALGORITHMS, Experiment, NotSavedError, Outcome, SetupError, check_env_id, train
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.output import harmless_output
 from sb3_tdc.run_folder import RunFolder
@@ -42,6 +42,11 @@ def make_parser() -> Parser:
     add("--checkpoint-freq", type=int, default=DEFAULT_FREQ, help="steps between checkpoints to resume from (-1: none)")
     add("--resume", type=Path, metavar="RUN_FOLDER", help="go on with a stopped run; it has all other arguments")
     add("--from", dest="from_step", type=int, metavar="STEP", help="with --resume: go back to the checkpoint of a step")
+    add(
+        "--start-over",
+        action="store_true",
+        help="with --resume: begin at step 0 again, and overwrite the results",
+    )
     add("--save-replay-buffer", action="store_true", help="save the replay buffer with the model")
     add("--log-interval", type=int, default=-1, help="episodes between log entries (-1: 4, 0: no log)")
     add("-tb", "--tensorboard-log", help='TensorBoard folder (none given: the run\'s own; "": off)')
@@ -82,8 +87,8 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
 
     :raises ValueError: for anything that is not allowed
     """
-    if args.from_step is not None:
-        raise ValueError("--from goes with --resume RUN_FOLDER")
+    if args.from_step is not None or args.start_over:
+        raise ValueError(f"{'--start-over' if args.start_over else '--from'} goes with --resume RUN_FOLDER")
     args.env = apply_common_arguments(args, args.env)
     check_env_id(args.env)
     if args.n_timesteps < 1 and args.n_timesteps != -1:
@@ -150,8 +155,13 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
         return None
     if stored.get("checkpoint_freq", 0) <= 0:
         raise ValueError(f"{folder.path} has no checkpoints: it was made without --checkpoint-freq")
+    has_state = bool(stored_steps(folder.checkpoint_folder)) and not args.start_over
+    if folder.has_results and not has_state and not args.start_over:
+        raise ValueError(
+            f"{folder.path} has results, but {folder.checkpoint_folder} has no checkpoints: "
+            "--start-over begins at step 0 again, and overwrites the results"
+        )
     if args.trained_agent is not None:
-        has_state = bool(stored_steps(folder.checkpoint_folder))
         args.trained_agent = folder.trained_agent if has_state else Path(args.trained_agent)
     apply_common_arguments(args, args.env)
     check_env_id(args.env)
@@ -164,7 +174,7 @@ def resume_experiment(args: argparse.Namespace, given: dict[str, Any]) -> Experi
 
 # What may differ when a run is resumed, and what is said only then; hyperparameters may too, and are recorded
 _OF_THE_PROCESS = ("num_threads", "device", "verbose", "progress")
-_OF_RESUMING = ("resume", "from_step", "hyperparams")
+_OF_RESUMING = ("resume", "from_step", "start_over", "hyperparams")
 
 
 def _experiment(
@@ -188,6 +198,7 @@ def _experiment(
         checkpoint_freq=args.checkpoint_freq,
         resume=args.resume is not None,
         from_step=args.from_step,
+        start_over=args.start_over,
         changed=changed,
         vec_env=args.vec_env,
         device=args.device,
@@ -226,7 +237,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Train, or resume a run.
 
     :param argv: arguments, those of the process by default
-    :return: 0, 1 if training diverged, 130 if the user stopped it
+    :return: 0, 1 if training diverged or its model could not be saved, 130 if the user stopped it
     """
     with harmless_output():
         return _main(argv)
@@ -251,6 +262,11 @@ def _main(argv: Sequence[str] | None) -> int:
         outcome = train(experiment)
     except (SetupError, NotRestoredError) as error:
         parser.fail(error)
+    except (NotSavedError, LockedError) as error:
+        print(error, file=sys.stderr)
+        if stored_steps(folder.checkpoint_folder):
+            print(f"To continue from the newest checkpoint:\n  {folder.command_to_resume}", file=sys.stderr)
+        return 1
     except NonFiniteError as error:
         print(f"{error}\nWhat was saved before stays in {folder.path}", file=sys.stderr)
         _say_how_to_go_back(folder)

@@ -1,5 +1,6 @@
 """``train.py`` and ``enjoy.py`` from end to end, in a temporary folder."""
 
+import importlib.metadata
 import os
 import shlex
 import signal

@@ -3,12 +3,13 @@
 from sb3_tdc.checkpoint.callback import DEFAULT_FREQ, Checkpoints
 from sb3_tdc.checkpoint.codec import NotCapturedError, NotRestoredError
 from sb3_tdc.checkpoint.simulators import Restorable
-from sb3_tdc.checkpoint.store import BrokenCheckpointError, stored_steps
+from sb3_tdc.checkpoint.store import BrokenCheckpointError, LockedError, stored_steps
 
 __all__ = [
     "DEFAULT_FREQ",
     "BrokenCheckpointError",
     "Checkpoints",
+    "LockedError",
     "NotCapturedError",
     "NotRestoredError",
     "Restorable",

@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_tdc.checkpoint import replay, state
 from sb3_tdc.checkpoint.codec import Initial, NotRestoredError
@@ -35,14 +36,15 @@ class Checkpoints(BaseCallback):
         checkpoints.restore(model)  # nothing happens if there are none yet
         model.learn(1_000_000, callback=[checkpoints, ...])
 
-    One is written before the first step, then every ``freq`` steps, when a rollout starts: at no other moment is all
-    that counts in the objects.
+    One is written before the first step, then every ``freq`` steps and before every evaluation, when a rollout starts:
+    at no other moment is all that counts in the objects.
 
     :param folder: of the checkpoints; of one run
     :param freq: environment steps between checkpoints, at least
     :param keep: how many of the newest stay on disk; besides, an older one stays, to go back to before a divergence,
         and the one that will take its place
     :param files: files that callbacks rewrite and that belong to the state; those of an ``EvalCallback`` do
+    :param hyperparams: plain values that the run was made from: one that is another when the run is resumed is refused
     :param verbose: 0: no messages but warnings
     :raises ValueError: if ``freq`` or ``keep`` is below 1, or another process writes to the folder
     """
@@ -55,6 +57,7 @@ class Checkpoints(BaseCallback):
         freq: int = DEFAULT_FREQ,
         keep: int = 2,
         files: Iterable[str | Path] = (),
+        hyperparams: Mapping[str, Any] | None = None,
         verbose: int = 1,
     ):
         super().__init__(verbose)
@@ -64,7 +67,9 @@ class Checkpoints(BaseCallback):
         self.freq, self.files = freq, [Path(file) for file in files]
         self.store = Store(Path(folder), keep, span=_OLDER * freq)
         self.is_wanted: Callable[[], bool] = lambda: False
+        self.hyperparams = json.loads(json.dumps(dict(hyperparams or {}), default=str))
         self.last_step: int | None = None  # of the newest checkpoint
+        self.last_try: int | None = None  # the same, or of one that could not be written
         self.seconds = 0.0  # that training has waited for checkpoints
         self._to_restore: Stored | None = None
         self._parts: dict[str, Any] = {}
@@ -103,8 +108,18 @@ class Checkpoints(BaseCallback):
             if parts["run"][name] != now:
                 difference = "is another" if name == "network" else f"was {parts['run'][name]}, and is {now}"
                 raise ValueError(f"{stored.path} is of another run: the {name} {difference}")
+        self._refuse_other_hyperparams(stored, parts["hyperparams"], changed)
         self._to_restore, self._parts, self._changed = stored, parts, tuple(changed)
         return stored.step
+
+    def _refuse_other_hyperparams(self, stored: Stored, then: dict[str, Any], changed: Sequence[str]) -> None:
+        now = self.hyperparams
+        for name in sorted({*then, *now} - {*changed, "n_timesteps"}):
+            if then.get(name) != now.get(name):
+                raise ValueError(
+                    f"{name} was {then.get(name, 'not given')} when {stored.path} was written, and is "
+                    f"{now.get(name, 'not given')} now: put it back, or change it by -params {name}:…"
+                )
 
     def _on_training_start(self) -> None:
         self.root = self.locals["callback"]
@@ -139,7 +154,7 @@ class Checkpoints(BaseCallback):
             warnings.warn(f"Not restored: {why}", RuntimeWarning, stacklevel=2)
         self._put_files_back(stored, parts["files"])
         self.store.remove_after(stored.step)
-        self._digests, self.last_step = dict(stored.shared), stored.step
+        self._digests, self.last_step, self.last_try = dict(stored.shared), stored.step, stored.step
         self._before = model.replay_buffer.pos, stored.step
         if restarted:  # the end of an episode was written into the last slot
             self._before = (model.replay_buffer.pos - 1) % model.replay_buffer.buffer_size, stored.step - model.n_envs
@@ -194,11 +209,20 @@ class Checkpoints(BaseCallback):
             self._restore()
             return
         step = self.model.num_timesteps
-        due = self.last_step is None or step - self.last_step >= self.freq
-        if (due or self.is_wanted()) and step != self.last_step:
+        due = self.last_try is None or step - self.last_try >= self.freq
+        if step != self.last_try and (due or self.is_wanted() or self._evaluation_is_next()):
             start = time.perf_counter()
+            self.last_try = step
             self._save(step)
             self.seconds += time.perf_counter() - start
+
+    def _evaluation_is_next(self) -> bool:
+        """Whether the rollout that starts has an evaluation in it, unless it is as long as episodes are."""
+        train_freq: Any = self.model.train_freq  # type: ignore[attr-defined]
+        if train_freq.unit != TrainFrequencyUnit.STEP:
+            return False
+        evaluations = [each for each in state.evaluations_of(self.root) if each.eval_freq > 0]
+        return any(each.n_calls % each.eval_freq + train_freq.frequency >= each.eval_freq for each in evaluations)
 
     def _save(self, step: int) -> None:
         first = self.last_step is None
@@ -206,8 +230,9 @@ class Checkpoints(BaseCallback):
             self._write(step)
         except OSError as error:
             warnings.warn(
-                f"The checkpoint of step {step:,} could not be written ({error}). Training goes on; "
-                + ("there is none yet" if first else f"that of step {self.last_step:,} stays"),
+                f"The checkpoint of step {step:,} could not be written ({error}). Training continues; "
+                + ("there is none yet" if first else f"that of step {self.last_step:,} stays")
+                + f". The next is due in {self.freq:,} steps.",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -218,10 +243,13 @@ class Checkpoints(BaseCallback):
         _refuse_non_finite(step, state.find_non_finite(model))
         parts, context = state.capture_state(model, self.root, self._initial)
         self._tell(context.left_out)
+        if not self.store.open_again(self._digests):
+            self._segments, self._digests, self._before, self._kept = [], {}, None, {}
         segments, digests = self._write_segment(step)
         files = [*self.files, *state.files_of_evaluations(self.root)]
         content = {
             "run": state.describe_run(model),
+            "hyperparams": self.hyperparams,
             "locations": Locations.capture(self.store.folder.parent, self._initial.texts),
             "platform": state.describe_platform(model),
             "state": parts,

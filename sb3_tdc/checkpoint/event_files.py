@@ -1,10 +1,15 @@
 """TensorBoard's event files: cut back to where they were, and continued in a new one without a gap or a duplicate."""
 
 import os
+import re
 import shutil
-from contextlib import suppress
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
@@ -55,7 +60,23 @@ def restore_event_files(
             path.unlink()
         elif path.stat().st_size > state["sizes"][path.name]:
             os.truncate(path, state["sizes"][path.name])
-    output.writer = SummaryWriter(str(folder), purge_step=step + 1)
+    with _named_after(state["sizes"]):
+        output.writer = SummaryWriter(str(folder), purge_step=step + 1)
+
+
+@contextmanager
+def _named_after(names: Iterable[str]) -> Iterator[None]:
+    """
+    Let an event file that is opened in this block come after others in the order of names, in which they are read.
+
+    The names begin with the second in which a file was opened: the clock may have been set back since, or be the same.
+    """
+    from tensorboard.summary.writer import event_file_writer
+
+    found = [re.match(r"events\.out\.tfevents\.(\d+)", name) for name in names]
+    second = max([time.time(), *(int(match[1]) + 1 for match in found if match)])
+    with mock.patch.object(event_file_writer, "time", SimpleNamespace(time=lambda: second)):
+        yield
 
 
 def _event_files(folder: Path) -> list[Path]:

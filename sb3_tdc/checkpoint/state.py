@@ -319,10 +319,17 @@ def files_of_evaluations(callback: BaseCallback) -> list[Path]:
     :return: what every ``EvalCallback`` among them rewrites
     """
     found: list[Path] = []
-    for evaluation in callbacks_of(callback):
-        if isinstance(evaluation, EvalCallback):
-            if evaluation.best_model_save_path is not None:
-                found.append(Path(evaluation.best_model_save_path) / "best_model.zip")
-            if evaluation.log_path is not None:
-                found.append(Path(f"{evaluation.log_path}.npz"))
+    for evaluation in evaluations_of(callback):
+        if evaluation.best_model_save_path is not None:
+            found.append(Path(evaluation.best_model_save_path) / "best_model.zip")
+        if evaluation.log_path is not None:
+            found.append(Path(f"{evaluation.log_path}.npz"))
     return found
+
+
+def evaluations_of(callback: BaseCallback) -> list[EvalCallback]:
+    """
+    :param callback: the root of all callbacks
+    :return: every ``EvalCallback`` among them
+    """
+    return [each for each in callbacks_of(callback) if isinstance(each, EvalCallback)]

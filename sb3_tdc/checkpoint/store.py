@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +27,10 @@ _STEP = re.compile(r"step_(\d{12,})")
 
 class BrokenCheckpointError(ValueError):
     """A checkpoint that is not as it was written; the message says which file."""
+
+
+class LockedError(ValueError):
+    """Another process writes to the folder."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +66,34 @@ class Store:
     :param keep: how many of the newest stay
     :param span: besides, one stays that is at least so many steps older than the newest, and less than twice as many
         as soon as there can be one; 0 for none
-    :raises ValueError: if another process writes there
+    :raises LockedError: if another process writes there
     """
 
     def __init__(self, folder: Path, keep: int, span: int):
         self.folder, self.keep, self.span = folder, keep, span
         (folder / _SHARED).mkdir(parents=True, exist_ok=True)
-        self._lock = _lock(folder / "lock")
+        # Outside the folder: whoever removes the checkpoints must not let a second process in
+        self._lock_file = folder.with_name(f"{folder.name}.lock")
+        self._lock = _lock(self._lock_file)
 
     def close(self) -> None:
         """Let another process write there."""
         self._lock.close()
+
+    def open_again(self, shared: Iterable[str]) -> bool:
+        """
+        Make the folder, and take the lock, again if somebody has removed them.
+
+        :param shared: names of shared files
+        :return: whether these are still there
+        :raises LockedError: if another process writes there by now
+        """
+        (self.folder / _SHARED).mkdir(parents=True, exist_ok=True)
+        if not _is_file_at(self._lock, self._lock_file):
+            lock = _lock(self._lock_file)
+            self._lock.close()
+            self._lock = lock
+        return all((self.folder / _SHARED / name).is_file() for name in shared)
 
     def steps(self) -> list[int]:
         """:return: of all that is there, intact or not, newest first"""
@@ -194,12 +215,17 @@ class Store:
             if path.name not in needed:
                 path.unlink(missing_ok=True)
 
-    def remove_all(self) -> None:
-        """Remove the folder."""
+    def clear(self) -> None:
+        """Remove all checkpoints."""
         for step in self.steps()[::-1]:
             self._remove(step)
-        self.close()
+
+    def remove_all(self) -> None:
+        """Remove the folder, and let go of it."""
+        self.clear()
         shutil.rmtree(self.folder, ignore_errors=True)
+        self._lock_file.unlink(missing_ok=True)
+        self.close()
 
     def _remove(self, step: int) -> None:
         path = self._path(step)
@@ -255,5 +281,12 @@ def _lock(path: Path) -> Any:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         file.close()
-        raise ValueError(f"Another process writes checkpoints to {path.parent}") from None
+        raise LockedError(f"Another process writes checkpoints to {path.parent}") from None
+    if not _is_file_at(file, path):  # removed by a process that has just finished
+        file.close()
+        return _lock(path)
     return file
+
+
+def _is_file_at(file: Any, path: Path) -> bool:
+    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())

@@ -14,7 +14,7 @@ from sb3_tdc.checkpoint import Checkpoints
 from sb3_tdc.checkpoint.locations import Locations
 from sb3_tdc.progress import ProgressCallback
 from tests.checkpoint.runs import CASES, Stop, StopAt, run
-from tests.checkpoint.test_resume import outcome, resume, run_train
+from tests.checkpoint.training import outcome, resume, run_train
 
 CASE = CASES["TD3"]
 

@@ -24,62 +24,12 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_tdc import TDC, busy_machine, interruption, train
+from sb3_tdc import TDC, busy_machine, interruption
 from sb3_tdc.checkpoint import Checkpoints, Restorable, callback, state
 from sb3_tdc.progress import ProgressCallback
 from tests.checkpoint import kill
-from tests.checkpoint.runs import Stop, StopAt, digest, files
-
-SMALL = ["-params", "policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
-N = 400
-
-
-def run_train(folder, *args, env="Hopper-v4", n=N, small=SMALL):
-    argv = ["--env", env, "-n", n, "--seed", 1, "-f", folder, "--eval-freq", 150, "--eval-episodes", 2]
-    return train.main([str(a) for a in [*argv, "--checkpoint-freq", 40, "--device", "cpu", *small, *args]])
-
-
-def resume(folder, *args):
-    return train.main(["--resume", str(folder), *map(str, args)])
-
-
-def outcome(folder):
-    name = next(folder.glob("*.zip")).stem if not (folder / "Hopper-v4.zip").exists() else "Hopper-v4"
-    model = TDC.load(folder / f"{name}.zip", device="cpu")
-    return {"weights": digest(model.policy.state_dict()), "steps": model.num_timesteps, **files(folder)}
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("whole")
-    assert run_train(folder) == 0
-    return outcome(folder / "tdc" / "Hopper-v4_1")
-
-
-@pytest.fixture
-def stop_at(monkeypatch):
-    """A signal in the middle of a step."""
-
-    def set_up(step):
-        original = ProgressCallback._on_step
-
-        def on_step(self):
-            if self.num_timesteps == step:
-                os.kill(os.getpid(), signal.SIGTERM)
-            return original(self)
-
-        monkeypatch.setattr(ProgressCallback, "_on_step", on_step)
-
-    return set_up
-
-
-@pytest.fixture
-def stopped(tmp_path, stop_at, monkeypatch):
-    """The folder of a run that was stopped at step 270."""
-    stop_at(270)
-    assert run_train(tmp_path) == 130
-    monkeypatch.undo()
-    return tmp_path / "tdc" / "Hopper-v4_1"
+from tests.checkpoint.runs import Stop, StopAt
+from tests.checkpoint.training import SMALL, fails, outcome, resume, run_train
 
 
 def test_a_signal_loses_nothing(tmp_path, stop_at, monkeypatch, whole, capsys):
@@ -136,27 +86,37 @@ def test_a_finished_run_is_left_alone(tmp_path, capsys):
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-def test_a_run_that_was_stopped_before_its_first_checkpoint_begins_again(stopped, whole):
+def test_starting_over_needs_consent(stopped, whole, capsys):
     shutil.rmtree(stopped / "checkpoints")
-    assert resume(stopped) == 0
+    before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
+    assert "--start-over begins at step 0 again" in fails(lambda: resume(stopped), capsys)
+    assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
+    assert resume(stopped, "--start-over") == 0
     assert outcome(stopped) == whole
+
+
+def test_starting_over_removes_checkpoints_that_are_there(stopped, whole, capsys):
+    assert resume(stopped, "--start-over") == 0
+    assert "Going on from" not in capsys.readouterr().out
+    assert outcome(stopped) == whole
+
+
+def test_a_run_that_was_stopped_before_its_first_step_begins_again(tmp_path, whole, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "_write", lambda *args: os.kill(os.getpid(), signal.SIGKILL))
+        if (child := os.fork()) == 0:
+            run_train(tmp_path)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert resume(tmp_path / "tdc" / "Hopper-v4_1") == 0
+    assert outcome(tmp_path / "tdc" / "Hopper-v4_1") == whole
 
 
 def test_a_damaged_checkpoint_costs_only_the_way_from_the_one_before(stopped, whole):
     newest = max((stopped / "checkpoints").glob("step_*"))
     (newest / "weights.pt").write_bytes((newest / "weights.pt").read_bytes()[:-1])
-    with pytest.warns(RuntimeWarning, match=r"weights.pt is damaged; going back to the checkpoint of step 240"):
+    with pytest.warns(RuntimeWarning, match=r"weights.pt is damaged; going back to the checkpoint of step 269"):
         assert resume(stopped) == 0
     assert outcome(stopped) == whole
-
-
-def fails(call, capsys):
-    with pytest.raises(SystemExit) as exit_:
-        call()
-    assert exit_.value.code == 2
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    return error
 
 
 def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
@@ -166,7 +126,7 @@ def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
         (["-n", "500"], "--n-timesteps 500 contradicts the run in"),
         (["-params", "buffer_size:5"], "buffer_size cannot be changed in a run that goes on; learning_rate, "),
         (["-params", "lamb:0.5"], "command line (-params): unknown key 'lamb'; did you mean 'lam'?"),
-        (["--from", "100"], "has no checkpoint of step 100; there are: 270, 240, "),
+        (["--from", "100"], "has no checkpoint of step 100; there are: 270, 269, "),
     ):
         assert message in fails(lambda args=args: resume(stopped, *args), capsys)
     assert "is not the folder of a run" in fails(lambda: resume(tmp_path), capsys)
@@ -204,7 +164,7 @@ def test_a_full_disk_stops_nothing_but_the_checkpoint(tmp_path, whole, monkeypat
     monkeypatch.setattr(Checkpoints, "_write", full)
     stop_at(300)
     with pytest.warns(
-        RuntimeWarning, match=r"could not be written .*No space left.* Training goes on; that of step 80"
+        RuntimeWarning, match=r"could not be written .*No space left.* Training continues; that of step 80"
     ):
         assert run_train(tmp_path) == 130
     monkeypatch.undo()

@@ -25,7 +25,7 @@ def write(store, step, content=b"content", shared=None):
 
 
 def names(folder):
-    return sorted(path.name for path in folder.rglob("*") if path.is_file() and path.name != "lock")
+    return sorted(path.name for path in folder.rglob("*") if path.is_file())
 
 
 def test_the_newest_are_kept_with_what_they_need(store):
