@@ -1,8 +1,10 @@
 """
-Kill a training run (SIGKILL) at random instants, resume it each time, compare the end with a run that was left alone.
+Stop a training run at random instants, resume it each time, compare the end with a run that was left alone.
 
-``python -m tests.checkpoint.kill --kills 50 --folder /tmp/kills`` prints where each kill struck and what differs; it
-goes on where it was if it is itself stopped.
+It is killed, or signalled together with the processes of its environments, also after the reader of its output has
+gone; sometimes its folder is moved, and it is resumed from another working directory.
+``python -m tests.checkpoint.kill --kills 50 --folder /tmp/kills`` prints what each stop interrupted and what differs;
+after an interruption, the same command continues.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -52,30 +55,57 @@ def arguments(folder: Path, steps: int) -> list[str]:
     run = ["--env", "Hopper-v4", "-n", str(steps), "--seed", "1", "-f", str(folder), "--save-freq", "1000"]
     often = ["--eval-freq", "120", "--eval-episodes", "3", "--checkpoint-freq", "60", "--log-interval", "1"]
     small += ["buffer_size:700", "n_envs:2", "normalize:true"]
+    run += ["--vec-env", "subproc"]
     return [*run, *often, "--save-replay-buffer", "--device", "cpu", "--num-threads", "1", "-params", *small]
 
 
-def start(args: list[str], stack: Path) -> subprocess.Popen:
-    """:param stack: where the process writes its stack when it is asked to"""
-    log = stack.with_suffix(".log").open("a")
+def start(args: list[str], stack: Path, directory: Path = ROOT) -> subprocess.Popen:
+    """
+    :param stack: where the process writes its stack when it is asked to
+    :return: the process; its output goes through a pipe to another one, which writes the log
+    """
+    log = stack.with_suffix(".log")
     command = [sys.executable, "-W", "ignore", "-c", _CODE, str(stack), *args]
-    return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    reader = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=log.open("a"), start_new_session=True)
+    with reader.stdin as pipe:  # type: ignore[union-attr]
+        process = subprocess.Popen(
+            command, cwd=directory, env=environment, stdout=pipe, stderr=pipe, start_new_session=True
+        )
+    process.reader = reader  # type: ignore[attr-defined]
+    return process
 
 
-def kill(process: subprocess.Popen, stack: Path) -> str:
+# How a run is stopped: signals, in their order, to its whole group; None ends the reader of its output
+WAYS: dict[str, list[signal.Signals | None]] = {
+    "SIGKILL": [signal.SIGKILL],
+    "SIGTERM": [signal.SIGTERM],
+    "SIGTERM twice": [signal.SIGTERM, signal.SIGTERM],
+    "SIGHUP": [signal.SIGHUP],
+    "SIGINT": [signal.SIGINT],
+    "closed pipe and SIGTERM": [None, signal.SIGTERM],
+}
+# It stopped after a signal, or the signal came before it could be handled
+_STATUSES = {130, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
+
+
+def stop(process: subprocess.Popen, stack: Path, way: str) -> str:
     """:return: what it was doing, or that it had ended"""
     if stack.exists():
         process.send_signal(signal.SIGUSR1)
         deadline = time.monotonic() + 1
         while stack.stat().st_size == 0 and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.0005)
-    ended = process.poll() is not None
-    if not ended:
-        os.killpg(process.pid, signal.SIGKILL)
+    for number in WAYS[way]:
+        if number is None:
+            process.reader.kill()  # type: ignore[attr-defined]
+            time.sleep(0.3)
+        elif process.poll() is None:
+            os.killpg(process.pid, number)
     code = process.wait()
-    if ended:
-        assert code == 0, f"left with status {code}: see {stack.with_suffix('.log')}"
+    if code == 0:
         return "ended"
+    assert code in _STATUSES, f"left with status {code}: see {stack.with_suffix('.log')}"
     lines = stack.read_text().splitlines() if stack.exists() else []
     functions = [line.rpartition(" in ")[2] for line in lines]
     return next((_PHASES[function] for function in functions if function in _PHASES), "importing")
@@ -101,49 +131,89 @@ def outcome(folder: Path) -> dict[str, Any]:
     return {**found, **files(folder)}
 
 
+@dataclass
+class Series:
+    """
+    A run that is stopped again and again.
+
+    :param folder: of the series; the run lies in ``<folder>/<place>/tdc/Hopper-v4_1``
+    :param struck: what each stop was, and interrupted
+    """
+
+    folder: Path
+    place: str = "stopped"
+    struck: list[str] = field(default_factory=list)
+
+    @property
+    def run(self) -> Path:
+        return self.folder / self.place / "tdc" / "Hopper-v4_1"
+
+    @property
+    def _record(self) -> Path:
+        return self.folder / "stops.json"
+
+    def load(self) -> None:
+        if self._record.exists():
+            self.place, self.struck = json.loads(self._record.read_text())
+
+    def stop_once(self, draw: random.Random, args: argparse.Namespace) -> None:
+        """Start or resume the run, and stop it; perhaps move it."""
+        directory = self.folder / f"directory_{len(self.struck)}" if draw.random() < 0.5 else ROOT
+        directory.mkdir(exist_ok=True)
+        command = ["--resume", os.path.relpath(self.run, directory)]
+        if not (self.run / "Hopper-v4" / "args.yml").exists():  # it had not begun
+            shutil.rmtree(self.folder / self.place, ignore_errors=True)
+            command = arguments(self.folder / self.place, args.steps)
+        stack = self.folder / f"stop_{len(self.struck)}"
+        stack.unlink(missing_ok=True)
+        process, way = start(command, stack, directory), draw.choice(list(WAYS))
+        _wait(process, stack, until_it_trains=draw.random() < 0.9)
+        time.sleep(draw.uniform(0, args.longest))
+        phase = stop(process, stack, way)
+        if phase == "ended":
+            raise SystemExit(f"The run ended after {len(self.struck)} stops: more --steps")
+        if directory != ROOT:
+            assert not list(directory.iterdir()), f"it wrote into {directory}"
+        moved = ""
+        if draw.random() < 0.3 and self.run.exists():
+            place, moved = f"moved_{len(self.struck)}", ", then moved"
+            os.replace(self.folder / self.place, self.folder / place)
+            self.place = place
+        self.struck.append(f"{way} while {phase}{moved}")
+        self._record.write_text(json.dumps([self.place, self.struck]))
+        print(f"Stop {len(self.struck)}: {self.struck[-1]}", flush=True)
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--longest", type=float, default=2.0, help="seconds of training before a kill, at most")
+    parser.add_argument("--longest", type=float, default=2.0, help="seconds of training before a stop, at most")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
+    args.folder = args.folder.resolve()
     args.folder.mkdir(parents=True, exist_ok=True)
 
-    alone, killed = (args.folder / name / "tdc" / "Hopper-v4_1" for name in ("alone", "killed"))
+    alone, series = args.folder / "alone" / "tdc" / "Hopper-v4_1", Series(args.folder)
+    series.load()
     if not (alone / "Hopper-v4" / "finished.yml").exists():
         assert not alone.exists(), f"{args.folder} holds a run that was not finished: take another folder"
         process = start(arguments(args.folder / "alone", args.steps), args.folder / "alone_stack")
         assert process.wait() == 0, "see alone_stack.log"
-
-    record = args.folder / "kills.json"
-    struck: list[str] = json.loads(record.read_text()) if record.exists() else []
-    draw = random.Random(args.seed + len(struck))
-    while len(struck) < args.kills:
-        stack = args.folder / f"kill_{len(struck)}"
-        stack.unlink(missing_ok=True)
-        command = ["--resume", str(killed)]
-        if not (killed / "Hopper-v4" / "args.yml").exists():  # it had not begun
-            shutil.rmtree(args.folder / "killed", ignore_errors=True)
-            command = arguments(args.folder / "killed", args.steps)
-        process = start(command, stack)
-        _wait(process, stack, until_it_trains=draw.random() < 0.9)
-        time.sleep(draw.uniform(0, args.longest))
-        where = kill(process, stack)
-        if where == "ended":
-            raise SystemExit(f"The run ended after {len(struck)} kills: more --steps")
-        struck.append(where)
-        record.write_text(json.dumps(struck))
-        print(f"Kill {len(struck)}: {where}", flush=True)
-    process = start(["--resume", str(killed)], args.folder / "last_stack")
+    draw = random.Random(args.seed + len(series.struck))
+    while len(series.struck) < args.kills:
+        series.stop_once(draw, args)
+    process = start(["--resume", str(series.run)], args.folder / "last_stack")
     assert process.wait() == 0, "see last_stack.log"
 
-    expected, found = outcome(alone), outcome(killed)
+    expected, found = outcome(alone), outcome(series.run)
     differing = [name for name in expected | found if expected.get(name) != found.get(name)]
-    print(f"{len(struck)} kills: {dict(collections.Counter(struck))}")
+    for what, count in sorted(collections.Counter(text.partition(",")[0] for text in series.struck).items()):
+        print(f"{count:4} × {what}")
+    print(f"{sum('moved' in text for text in series.struck)} of {len(series.struck)} times its folder was moved")
     print(f"{len(expected)} fingerprints compared; different: {differing or 'none'}")
-    assert yaml.safe_load((killed / "Hopper-v4" / "args.yml").read_text())["seed"] == 1
+    assert yaml.safe_load((series.run / "Hopper-v4" / "args.yml").read_text())["seed"] == 1
     return int(bool(differing))
 
 
