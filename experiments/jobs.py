@@ -18,10 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from experiments.results import Run, same_settings
-from sb3_tdc import train
+from sb3_tdc import plain_yaml, train
 from sb3_tdc.checkpoint import DEFAULT_FREQ
 from sb3_tdc.checkpoint.store import stored_steps
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
@@ -224,7 +222,7 @@ def count_cores() -> int:
 
 
 def _to_yaml(value: Any) -> str:
-    text = yaml.safe_dump(value, default_flow_style=True, width=sys.maxsize)
+    text = plain_yaml.dump(value, default_flow_style=True, width=sys.maxsize)
     return text.removesuffix("\n").removesuffix("\n...")
 
 

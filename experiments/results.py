@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from sb3_tdc.experiment import ALGORITHMS
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
@@ -57,7 +56,7 @@ class Run:
             changed = {key: args[key] for key, default in _ARGUMENTS.items() if args.get(key, default) != default}
             run = cls(folder, args["algo"], args["env"], args["seed"], _flatten({**config, **changed}))
             run.n_timesteps  # noqa: B018  # must be there
-        except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, KeyError, TypeError, AttributeError) as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise ValueError(f"{path} has no readable config.yml and args.yml ({reason})") from error
         return run

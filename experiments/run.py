@@ -20,7 +20,7 @@ from experiments.jobs import Job, cluster, count_cores, run
 from experiments.results import default_settings, find_runs, same_settings
 from experiments.suites import ISAAC, PACKAGES, PAPER, SUITES, Cell
 from sb3_tdc import train
-from sb3_tdc.arguments import Parser, one_of
+from sb3_tdc.arguments import Names, Parser, one_of
 from sb3_tdc.experiment import ALGORITHMS
 from sb3_tdc.experiment import train as train_experiment
 from sb3_tdc.hyperparams import hyperparams_file, read_entry, suggest
@@ -243,7 +243,7 @@ def make_parser() -> Parser:
     add("suite", type=one_of("suite", [*SUITES, "all"]), help=f"{', '.join(SUITES)}, or all of the paper's")
     add("--seeds", type=int, nargs="+", default=[5], help="how many (one number), or which (several)")
     add("--scale", type=float, default=1.0, help="fraction of the suite's steps")
-    add("--only", nargs="+", default=[], metavar="NAME", help="algorithms and environments")
+    add("--only", nargs="+", action=Names, default=[], metavar="NAME", help="algorithms and environments")
     add("--logs", type=Path, default=Path("logs"), help="folder of all runs")
     add("--jobs", type=int, help="runs at once (default: one a core)")
     add("--address", help="of a Ray cluster that shares this file system (default: this machine)")

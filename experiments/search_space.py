@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
+
+from sb3_tdc import plain_yaml
 
 # Those of the paper
 LAMBDAS = [round(0.1 * i, 1) for i in range(1, 11)]
@@ -71,8 +72,8 @@ def _parse_distribution(text: str, kind: str, *bounds: str) -> Distribution:
 
 def _parse_list(text: str, values: str) -> list[Any]:
     try:
-        parsed = yaml.safe_load(values)
-    except yaml.YAMLError:
+        parsed = plain_yaml.load(values, "--search")
+    except ValueError:
         parsed = None
     if not isinstance(parsed, list) or not parsed:
         raise ValueError(f"--search {text!r}: the values must be a list, [value, ...], or a distribution")

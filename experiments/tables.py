@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from experiments import statistics
 from experiments.results import Group, Run
 from experiments.test_returns import EPISODES, read_test_returns
+from sb3_tdc import plain_yaml
 
 TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
 _PUBLISHED = Path(__file__).with_name("published.yml")
@@ -116,7 +116,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
                 "What": "mean of the last evaluation ± std over seeds",
             }
         )
-    published = yaml.safe_load(_PUBLISHED.read_text())
+    published = plain_yaml.load(_PUBLISHED.read_text(), _PUBLISHED.name)
     for entry in published:
         for algorithm, returns in entry["returns"].items():
             note = entry.get("notes", {}).get(algorithm)

@@ -13,12 +13,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pandas as pd
-import yaml
 
 from experiments.figures import COLORS, draw_sweep
 from experiments.jobs import Job, cluster, count_cores, eval_freq, stop
 from experiments.results import Run
 from experiments.search_space import LAMBDAS, make_candidates, parse_space
+from sb3_tdc import plain_yaml
 from sb3_tdc.arguments import KeyValues, Parser, add_package_argument, import_packages, one_of, plain_arguments
 from sb3_tdc.experiment import ALGORITHMS, check_env_id
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
@@ -189,7 +189,7 @@ def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: S
     best = candidates[int(table.index[0])][0]
     entry, _ = read_entry(hyperparams_file(best.algo), best.env_id)
     content = {best.env_id: {**entry, **best.settings}}  # with the steps of a whole training
-    (folder / "best.yml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "best.yml").write_text(plain_yaml.dump(content, sort_keys=False))
     print(f"Ranking, figures and the best hyperparameters are in {folder}")
     command = ["python", "train.py", "--algo", best.algo, "--env", best.env_id, "-conf", str(folder / "best.yml")]
     print("  " + shlex.join([*command, *(["--gym-packages", *best.packages] if best.packages else [])]))
@@ -297,8 +297,8 @@ def _read_arguments(args: argparse.Namespace, given: dict[str, Any]) -> None:
     :raises ValueError: if there is none, or the command line contradicts it
     """
     try:
-        stored = yaml.safe_load((args.resume / _ARGUMENTS).read_text())
-    except (OSError, yaml.YAMLError) as error:
+        stored = plain_yaml.load((args.resume / _ARGUMENTS).read_text(), str(args.resume / _ARGUMENTS))
+    except OSError as error:
         raise ValueError(f"{args.resume} is not the folder of a search: it has no readable {_ARGUMENTS}") from error
     of_the_process = ("resume", "jobs", "address")
     for name, value in given.items():
@@ -336,7 +336,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with cluster(args.address, args.jobs):
             if args.resume is None:
                 args.folder.mkdir(parents=True)
-                (args.folder / _ARGUMENTS).write_text(yaml.safe_dump(typed))
+                (args.folder / _ARGUMENTS).write_text(plain_yaml.dump(typed))
             print(
                 f"{len(candidates)} candidates × {args.seeds} seeds, {args.n_timesteps:,} steps each, evaluated every "
                 f"{eval_freq(args.n_timesteps):,} (5 episodes); one CPU and one thread a seed; in {args.folder}",

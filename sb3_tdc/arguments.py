@@ -8,15 +8,20 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import torch as th
-import yaml
 
+from sb3_tdc import plain_yaml
 from sb3_tdc.hyperparams import suggest
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that names the nearest flag for a misspelt one."""
+    """
+    An argument parser that names the nearest flag for a misspelt one.
 
-    def __init__(self, description: str):
+    :param zoo_flags: flags of RL Zoo that have another form here, and which
+    """
+
+    def __init__(self, description: str, zoo_flags: Mapping[str, str] | None = None):
+        self.zoo_flags = zoo_flags or {}
         super().__init__(
             description=description, allow_abbrev=False, formatter_class=argparse.ArgumentDefaultsHelpFormatter
         )
@@ -26,6 +31,8 @@ class Parser(argparse.ArgumentParser):
     ) -> argparse.Namespace:
         parsed, unknown = self.parse_known_args(args, namespace)
         if unknown:
+            if unknown[0] in self.zoo_flags:
+                self.error(f"{unknown[0]} is RL Zoo's: {self.zoo_flags[unknown[0]]}")
             flags = [flag for action in self._actions for flag in action.option_strings]
             self.error(f"unknown argument {unknown[0]!r}{suggest(unknown[0], flags)}")
         return parsed
@@ -43,7 +50,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class KeyValues(argparse.Action):
-    """``key:value key:value`` → a dict; the values are YAML, never evaluated."""
+    """``key:value key:value`` → a dict; the values are YAML, never evaluated. A second flag adds to the first."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
@@ -54,10 +61,24 @@ class KeyValues(argparse.Action):
             if not colon or not key:
                 raise argparse.ArgumentError(self, f"must be key:value, got {text!r}")
             try:
-                pairs[key] = yaml.safe_load(value)
-            except yaml.YAMLError:
+                pairs[key] = plain_yaml.load(value, key)
+            except ValueError:
                 raise argparse.ArgumentError(self, f"the value of {key} is not valid YAML: {value!r}") from None
-        setattr(namespace, self.dest, pairs)
+        setattr(namespace, self.dest, {**_given_before(namespace, self, dict), **pairs})
+
+
+class Names(argparse.Action):
+    """``name name`` → a list. A second flag adds to the first."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        setattr(namespace, self.dest, [*_given_before(namespace, self, list), *values])
+
+
+def _given_before(namespace: argparse.Namespace, action: argparse.Action, kind: type) -> Any:
+    value = getattr(namespace, action.dest, None)
+    return value if isinstance(value, kind) and value is not action.default else kind()
 
 
 def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
@@ -75,7 +96,9 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
 
 def add_package_argument(parser: Parser) -> None:
     """For :func:`import_packages`."""
-    parser.add_argument("--gym-packages", nargs="+", default=[], help="packages to import, that register environments")
+    parser.add_argument(
+        "--gym-packages", nargs="+", action=Names, default=[], help="packages to import, that register environments"
+    )
 
 
 def add_common_arguments(parser: Parser, algorithms: Iterable[str]) -> None:

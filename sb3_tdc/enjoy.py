@@ -15,18 +15,31 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments
-from sb3_tdc.experiment import ALGORITHMS, check_env_id, load_model, make_envs
+from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments, import_packages
+from sb3_tdc.experiment import ALGORITHMS, SETUP_ERRORS, check_env_id, load_model, make_envs
 from sb3_tdc.explain import play_episodes, steps_until_negligible, write_explanation
 from sb3_tdc.hyperparams import Hyperparams, parse
-from sb3_tdc.rendering import VideoWriter, choose_gl_backend, follow_agent, has_display
+from sb3_tdc.rendering import VideoWriter, choose_gl_backend, display_works, follow_agent, render_modes
 from sb3_tdc.run_folder import RunFolder
 from sb3_tdc.tdc import TDC
+
+# What users of RL Zoo type by habit
+_ZOO_FLAGS = {
+    "--deterministic": "the mean action is the default here; --stochastic samples",
+    "--n-envs": "one environment is played; --n-episodes says how often",
+    "--norm-reward": "returns are those of the environment, never normalised",
+    "--reward-log": "every return is printed; those of training are in monitor.csv in the run folder",
+    "--custom-objects": "objects that cannot be loaded here are refused by name; --trust loads as SB3 does",
+    **dict.fromkeys(("-P", "--progress"), "every episode is printed as it ends"),
+    "--render": "there is a window where there is a display; --record FILE.mp4 writes a video",
+}
 
 
 def make_parser() -> Parser:
     """:return: RL Zoo's flags, and the folder of a run instead of ``--algo``, ``--env`` and ``--exp-id``"""
-    parser = Parser("Watch a trained agent: in a window where there is a display, with --record where there is none.")
+    parser = Parser(
+        "Watch a trained agent: in a window where there is a display, with --record where there is none.", _ZOO_FLAGS
+    )
     add = parser.add_argument
     add("run", nargs="?", type=Path, help="folder of a run, or a zip (else: the run of --algo, --env and --exp-id)")
     add_common_arguments(parser, ALGORITHMS)
@@ -181,15 +194,32 @@ def play(model: BaseAlgorithm, env: VecEnv, args: argparse.Namespace, video: Vid
     return returns
 
 
-def _render_mode(args: argparse.Namespace, env_id: str) -> str | None:
-    """Decide what is drawn and say how; MuJoCo's backend is chosen before it is imported."""
-    if args.record is None and (args.no_render or not has_display()):
-        if not args.no_render:
-            print("There is no display: no window. To see the agent: --record FILE.mp4")
-        return None
-    if "mujoco" in str(gym.spec(env_id).entry_point):
-        print(choose_gl_backend())
-    return "human" if args.record is None else "rgb_array"
+def _rendering(args: argparse.Namespace, env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """
+    Decide what is drawn and say how; MuJoCo's backend is chosen before it is imported.
+
+    :param env_kwargs: what the environment is made with anyway; a ``render_mode`` there is one that it needs
+    :return: its ``render_mode``, if it is to have one
+    :raises ValueError: if it cannot be recorded
+    """
+    needed, modes = env_kwargs.get("render_mode"), render_modes(env_id)
+    wanted = None if args.no_render and args.record is None else "human" if args.record is None else "rgb_array"
+    why = f"it is made with render_mode {needed}"
+    possible = {needed} if needed is not None else modes | ({"human"} if "rgb_array" in modes else set())
+    if needed is None:
+        why = f"it draws {', '.join(sorted(modes)) or 'nothing'}"
+    if wanted == "rgb_array" and wanted not in possible:
+        raise ValueError(f"{env_id} cannot be recorded: {why}")
+    if wanted == "human" and wanted not in possible:
+        print(f"No window: {why}" + (". To see the agent: --record FILE.mp4" if "rgb_array" in possible else ""))
+        wanted = None
+    if wanted == "human" and not display_works():
+        print("There is no display: no window. To see the agent: --record FILE.mp4")
+        wanted = None
+    drawn = needed or wanted
+    if drawn is not None and "mujoco" in str(gym.spec(env_id).entry_point):
+        print(choose_gl_backend(drawn == "human"))
+    return {} if needed is not None or drawn is None else {"render_mode": drawn}
 
 
 def check_explainable(args: argparse.Namespace, trained: Trained) -> None:
@@ -231,7 +261,26 @@ def explain(model: TDC, env: VecEnv, trained: Trained, n_episodes: int, limit: i
     write_explanation(model, episodes, trained.path.with_name(f"{trained.path.stem}_critics"), title)
 
 
+def _make_env(trained: Trained, args: argparse.Namespace, env_kwargs: dict[str, Any]) -> VecEnv:
+    """:raises ValueError: with what the environment or a wrapper raises"""
+    try:
+        return make_envs(
+            trained.env_id,
+            trained.hyperparams,
+            args.seed,
+            n_envs=1,
+            env_kwargs=env_kwargs,
+            normalization=trained.normalization,
+            training=False,
+            trust=args.trust,
+        )
+    except SETUP_ERRORS as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{trained.env_id} cannot be made: {reason}") from error
+
+
 def _run(args: argparse.Namespace) -> int:
+    args.env = import_packages(args, args.env)  # perhaps with its package, as train.py takes it
     if args.trust:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
     trained = find_trained(args)
@@ -242,19 +291,11 @@ def _run(args: argparse.Namespace) -> int:
         check_explainable(args, trained)
         limit, env_kwargs = extend_time_limit(trained, env_kwargs)
     else:
-        env_kwargs["render_mode"] = _render_mode(args, trained.env_id)
+        made_with = {**gym.spec(trained.env_id).kwargs, **trained.hyperparams.env_kwargs, **env_kwargs}
+        env_kwargs.update(_rendering(args, trained.env_id, made_with))
 
     with ExitStack() as stack:
-        env = make_envs(
-            trained.env_id,
-            trained.hyperparams,
-            args.seed,
-            n_envs=1,
-            env_kwargs=env_kwargs,
-            normalization=trained.normalization,
-            training=False,
-            trust=args.trust,
-        )
+        env = _make_env(trained, args, env_kwargs)
         stack.callback(env.close)
         for unwrapped in env.get_attr("unwrapped"):
             follow_agent(unwrapped)

@@ -106,7 +106,7 @@ class SetupError(ValueError):
 
 
 # What constructors of environments, wrappers, algorithms and callbacks raise for what they do not allow
-_SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportError, OSError, EOFError, gym.error.Error)
+SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportError, OSError, EOFError, gym.error.Error)
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def train(experiment: Experiment) -> Outcome:
             stack.close()
             if not experiment.resume:
                 shutil.rmtree(experiment.folder.path)
-            if not isinstance(error, (*_SETUP_ERRORS, KeyboardInterrupt)):
+            if not isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt)):
                 raise
             raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
         stack.callback(progress.close)

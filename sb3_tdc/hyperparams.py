@@ -8,6 +8,7 @@ import collections.abc
 import difflib
 import importlib
 import inspect
+import re
 import types
 import typing
 from collections.abc import Callable, Iterable
@@ -16,10 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_tdc import plain_yaml
 
 # What an entry may say besides the keyword arguments of the algorithm, with its type
 _RUN_KEYS: dict[str, Any] = {
@@ -89,11 +92,9 @@ def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], str]:
     :raises ValueError: if the file cannot be read, or has neither an entry nor a default
     """
     try:
-        entries = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+        entries = plain_yaml.load(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {getattr(error, 'strerror', None) or 'is not a text'}") from error
     if not isinstance(entries, dict) or not all(isinstance(e, dict) for e in entries.values()):
         raise ValueError(f"{path} must map environment ids to hyperparameters")
     name = _nearest_version(env_id, entries)
@@ -140,6 +141,9 @@ def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> 
     if values.get("noise_type") not in (None, *_NOISE_TYPES):
         raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {values['noise_type']!r}")
     _convert_policy(values, algorithm, where)
+    if "monitor_kwargs" in values:
+        hints = {key: hint for key, hint in constructor_hints(Monitor).items() if key not in ("env", "filename")}
+        values["monitor_kwargs"] = _convert_mapping(values["monitor_kwargs"], hints, f"{where}: monitor_kwargs")
 
     run = {key: values.pop(key) for key in _RUN_KEYS if key in values}
     normalize = run.pop("normalize", False)
@@ -227,10 +231,14 @@ def _convert(value: Any, hint: Any) -> Any:
         return _schedule(value)
     if origin is type or hint is type:
         return _import_class(value, args[0] if args else object)
+    if origin is tuple and isinstance(value, list) and args[-1] is Ellipsis:
+        return tuple(_convert(item, args[0]) for item in value)
     if origin is tuple and isinstance(value, list) and len(value) == len(args):
         return tuple(_convert(v, a) for v, a in zip(value, args, strict=True))
     if origin is list and isinstance(value, list):
         return [_convert(v, args[0]) for v in value]
+    if dict in (origin, hint) and isinstance(value, str):
+        value = plain_yaml.read_notation(value)
     if origin is dict and isinstance(value, dict):
         return {k: _convert(v, args[1]) for k, v in value.items()}
     if hint is type(None) and value is None:
@@ -272,8 +280,7 @@ def _import_class(name: Any, base: Any = object) -> type:
     if not isinstance(name, str):
         raise TypeError
     modules, _, attribute = name.rpartition(".")
-    if modules == "nn":
-        modules = "torch.nn"
+    modules = re.sub(r"^(?:th\b|(?=nn\b))", lambda match: "torch" if match[0] else "torch.", modules)
     for module in [modules] if modules else _CLASS_MODULES:
         try:
             found = getattr(importlib.import_module(module), attribute, None)
@@ -309,7 +316,7 @@ def _describe(hint: Any) -> str:
     if origin is type:
         return f"the name of a {args[0].__name__} class"
     if origin in (tuple, list):
-        return f"a list of {', '.join(_describe(a) for a in args)}"
+        return f"a list of {', '.join(_describe(a) for a in args if a is not Ellipsis)}"
     simple = {float: "a number", int: "an integer", bool: "true or false", str: "a text", type(None): "null"}
     simple.update({dict: "a mapping", list: "a list", th.device: "a device"})
     if origin is dict or hint in simple:

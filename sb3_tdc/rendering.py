@@ -1,5 +1,6 @@
 """Pictures without a display: which OpenGL backend MuJoCo can use, and video files."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -9,28 +10,47 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 _GL_BACKENDS = ("egl", "osmesa")
+_TRY_DISPLAY = "import sys, glfw; sys.exit(not glfw.init())"
 _TRY_BACKEND = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
 
 
-def has_display() -> bool:
-    """:return: whether a window can be opened"""
-    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+def render_modes(env_id: str) -> set[str]:
+    """Return the modes that an environment can be made with: none if its constructor takes no ``render_mode``."""
+    entry_point = gym.spec(env_id).entry_point
+    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    parameters = inspect.signature(creator).parameters.values()
+    if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+        return set()
+    metadata = getattr(creator, "metadata", None) or {}  # a function has none: it may draw anything
+    return set(metadata.get("render_modes", ("human", "rgb_array")))
 
 
-def choose_gl_backend() -> str:
+def display_works() -> bool:
+    """Return whether a window can be opened: a display may be named that is gone (ssh -X, tmux)."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    attempt = subprocess.run([sys.executable, "-c", _TRY_DISPLAY], capture_output=True)
+    return attempt.returncode == 0
+
+
+def choose_gl_backend(is_window: bool = False) -> str:
     """
     Set ``MUJOCO_GL`` to a backend that works without a display, unless it is set already or there is a display.
 
     To be called before ``mujoco`` is imported: it reads the variable then.
 
+    :param is_window: whether a window is wanted, for which there is a display
     :return: a sentence on what is used
     :raises ValueError: if nothing works, with the commands that install one
     """
     if os.environ.get("MUJOCO_GL"):
         return f"Rendering with MUJOCO_GL={os.environ['MUJOCO_GL']} (from the environment)"
-    if has_display():
+    if is_window or display_works():
         return "Rendering with the display's OpenGL"
     for backend in _GL_BACKENDS:
         attempt = subprocess.run(

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from sb3_tdc import plain_yaml
 from sb3_tdc.hyperparams import suggest
 from sb3_tdc.versions import commit_of_the_code, library_versions, processor_name
 
@@ -122,7 +121,7 @@ class RunFolder:
 
     def mark_finished(self, n_timesteps: int) -> None:
         """The last step has been done, and the model saved."""
-        _write_text(self._finished, yaml.safe_dump({"n_timesteps": n_timesteps}))
+        _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
 
     def checkpoints(self) -> dict[int, Path]:
         """:return: the model of every checkpoint, by timestep, oldest first"""
@@ -165,17 +164,17 @@ class RunFolder:
         :param config: all of them, as they are now
         """
         change = {"step": step, "hyperparams": {name: config[name] for name in names}}
-        _write_text(self._changes, yaml.safe_dump({"changes": [*self.changes, change]}))
-        _write_text(self.path / self.env_name / "config.yml", yaml.safe_dump(config))
+        _write_text(self._changes, plain_yaml.dump({"changes": [*self.changes, change]}))
+        _write_text(self.path / self.env_name / "config.yml", plain_yaml.dump(config))
 
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
         """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""
         folder = self.path / self.env_name
         _write_text(folder / "command.txt", shlex.join(sys.orig_argv) + "\n")
-        _write_text(folder / "config.yml", yaml.safe_dump(config))
-        _write_text(folder / "args.yml", yaml.safe_dump(args))
+        _write_text(folder / "config.yml", plain_yaml.dump(config))
+        _write_text(folder / "args.yml", plain_yaml.dump(args))
         about = {**library_versions(), "sb3_tdc": commit_of_the_code() or "a wheel", "processor": processor_name()}
-        _write_text(folder / "versions.yml", yaml.safe_dump(about))
+        _write_text(folder / "versions.yml", plain_yaml.dump(about))
 
 
 def save(save_as: Callable[[Path], Any], path: Path) -> None:
@@ -192,31 +191,12 @@ def save(save_as: Callable[[Path], Any], path: Path) -> None:
         beside.unlink(missing_ok=True)
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """YAML of plain values, and the ordered mappings and tuples that RL Zoo writes."""
-
-
-_PYTHON = "tag:yaml.org,2002:python"
-
-
-def _construct_sequence(loader: Any, node: Any) -> list[Any]:
-    return loader.construct_sequence(node, deep=True)
-
-
-def _construct_mapping(loader: Any, node: Any) -> dict[str, Any]:
-    return dict(*_construct_sequence(loader, node))
-
-
-_PlainLoader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _construct_mapping)
-_PlainLoader.add_constructor(f"{_PYTHON}/tuple", _construct_sequence)
-
-
 def _read_yaml(path: Path) -> dict[str, Any]:
     """:raises ValueError: if a file is not a mapping of plain values"""
     try:
-        content = yaml.load(path.read_text(), _PlainLoader)
-    except (OSError, yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not YAML of plain values: {' '.join(str(error).split())}") from error
+        content = plain_yaml.load(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path} must be a mapping")
     return content

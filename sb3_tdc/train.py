@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from stable_baselines3.common.utils import set_random_seed
 
+from sb3_tdc import plain_yaml
 from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments, plain_arguments
 from sb3_tdc.checkpoint import DEFAULT_FREQ, LockedError, NotRestoredError, stored_steps
 from sb3_tdc.experiment import ALGORITHMS, Experiment, NotSavedError, Outcome, SetupError, check_env_id, train
@@ -24,10 +24,32 @@ from sb3_tdc.output import harmless_output
 from sb3_tdc.run_folder import RunFolder
 from sb3_tdc.tdc import NonFiniteError
 
+_TUNE = "to search hyperparameters: python tune.py (--search, --samples, --seeds, --jobs)"
+_TRACK = "a run writes TensorBoard files into its folder; `wandb sync` uploads them"
+# What users of RL Zoo type by habit
+_ZOO_FLAGS = {
+    **dict.fromkeys(
+        (
+            *("-optimize", "--optimize-hyperparameters", "--optimization-log-path", "--n-trials", "--max-total-trials"),
+            *("--n-jobs", "-n-jobs", "--sampler", "--pruner", "--n-startup-trials", "--n-evaluations", "--storage"),
+            *("--study-name", "--trial-id", "--no-optim-plots"),
+        ),
+        _TUNE,
+    ),
+    **dict.fromkeys(
+        ("--track", "--wandb-project-name", "--wandb-entity", "--wandb-group", "-tags", "--wandb-tags"), _TRACK
+    ),
+    "--truncate-last-trajectory": "with -i and a replay buffer, the episode under way always ends where it was saved",
+    "--n-envs": "environments are a hyperparameter, -params n_envs:4",
+    "--norm-reward": "normalisation is a hyperparameter, -params normalize:true",
+    "--yaml-file": "--conf-file FILE",
+    "--deterministic": "evaluations always take the mean action",
+}
+
 
 def make_parser() -> Parser:
     """:return: RL Zoo's flags, names and meanings"""
-    parser = Parser("Train an agent. Hyperparameters come from hyperparams/<algo>.yml, as in RL Zoo.")
+    parser = Parser("Train an agent. Hyperparameters come from hyperparams/<algo>.yml, as in RL Zoo.", _ZOO_FLAGS)
     add_common_arguments(parser, ALGORITHMS)
     add = parser.add_argument
     add("--env", default="HalfCheetah-v4", help="environment id")
@@ -77,7 +99,7 @@ def read_hyperparams(args: argparse.Namespace) -> Hyperparams:
     if args.verbose > 0:
         nearest = "" if name == "default" else "; this is the nearest version"
         print(f"Hyperparameters: {where}{'' if name == args.env else f' (it has no entry for {args.env}{nearest})'}")
-        print(textwrap.indent(yaml.safe_dump(hyperparams.raw, sort_keys=False), "  "), end="")
+        print(textwrap.indent(plain_yaml.dump(hyperparams.raw, sort_keys=False), "  "), end="")
     return hyperparams
 
 

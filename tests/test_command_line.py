@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -410,3 +411,53 @@ def test_flags_cannot_be_abbreviated_by_accident():
     parser.add_argument("--eval-freq", type=int)
     with pytest.raises(SystemExit):
         parser.parse_args(["--eval", "3"])
+
+
+@pytest.mark.parametrize(
+    ("main", "flags", "sentence"),
+    [
+        (train.main, ["--track"], "--track is RL Zoo's: a run writes TensorBoard files into its folder"),
+        (train.main, ["-optimize"], "-optimize is RL Zoo's: to search hyperparameters: python tune.py"),
+        (train.main, ["--n-trials", "5"], "--n-trials is RL Zoo's: to search hyperparameters: python tune.py"),
+        (enjoy.main, ["--deterministic"], "--deterministic is RL Zoo's: the mean action is the default here"),
+        (enjoy.main, ["--n-envs", "4"], "--n-envs is RL Zoo's: one environment is played"),
+        (enjoy.main, ["--norm-reward"], "--norm-reward is RL Zoo's: returns are those of the environment"),
+    ],
+)
+def test_flags_of_rl_zoo_that_have_another_form_here(main, flags, sentence, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(flags)
+    assert exit_.value.code == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_every_flag_of_rl_zoo_is_known_or_answered():
+    rl_zoo3 = pytest.importorskip("rl_zoo3")
+    for name, module in (("train", train), ("enjoy", enjoy)):
+        source = (Path(rl_zoo3.__file__).parent / f"{name}.py").read_text()
+        flags = re.findall(r"""["'](--?[a-zA-Z][\w-]*)["']""", source)
+        parser = module.make_parser()
+        known = {flag for action in parser._actions for flag in action.option_strings} | set(parser.zoo_flags)
+        assert len(flags) > 20
+        assert set(flags) - known == set()
+
+
+def test_a_second_flag_adds_to_the_first():
+    flags = ["-params", "lam:0.5", "gamma:0.9", "-params", "gamma:0.8", "tau:1e-2"]
+    args = train.make_parser().parse_args([*flags, "--gym-packages", "a", "b", "--gym-packages", "c"])
+    assert args.hyperparams == {"lam": 0.5, "gamma": 0.8, "tau": 0.01}
+    assert args.gym_packages == ["a", "b", "c"]
+    assert train.make_parser().parse_given(flags)["hyperparams"] == args.hyperparams
+    assert train.make_parser().parse_args([]).hyperparams == {}
+
+
+def test_enjoy_finds_what_train_made_of_an_environment_with_its_package(tmp_path):
+    package = "tests.test_rendering"
+    code = "gym.register('InPackage-v0', Undrawn) if 'InPackage-v0' not in gym.registry else None"
+    (tmp_path / "in_package.py").write_text(f"import gymnasium as gym\nfrom {package} import Undrawn\n{code}\n")
+    sys.path.insert(0, str(tmp_path))
+    try:
+        assert run_train(tmp_path, env="in_package:InPackage-v0", n=120) == 0
+        assert run_enjoy("--env", "in_package:InPackage-v0", "-f", tmp_path) == 0
+    finally:
+        sys.path.remove(str(tmp_path))

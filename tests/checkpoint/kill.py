@@ -34,6 +34,7 @@ ROOT = Path(__file__).parents[2]
 _CODE = """
 import faulthandler, signal, sys
 faulthandler.register(signal.SIGUSR1, open(sys.argv.pop(1), "w"))
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored below a job in the background of a shell
 from sb3_tdc.train import main
 sys.exit(main())
 """

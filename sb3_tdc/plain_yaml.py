@@ -1,0 +1,104 @@
+"""
+YAML and RL Zoo's Python notation → plain values, and back. Every file and argument is read here; nothing is evaluated.
+
+Numbers are those of YAML 1.2: ``1e-3`` is a number, also inside a list or a mapping (PyYAML reads YAML 1.1, where it
+is a text).
+"""
+
+import ast
+import re
+from typing import Any
+
+import yaml
+
+_FLOAT = "tag:yaml.org,2002:float"
+_PYTHON = "tag:yaml.org,2002:python"
+_NUMBER = re.compile(
+    r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*|[0-9][0-9_]*(?=[eE]))(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+)
+
+
+def _resolvers(base: Any) -> dict[str, Any]:
+    return {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag != _FLOAT]
+        for first, resolvers in base.yaml_implicit_resolvers.items()
+    }
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values, and the ordered mappings and tuples in RL Zoo's run folders."""
+
+    yaml_implicit_resolvers = _resolvers(yaml.SafeLoader)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes the texts that the loader would take for numbers."""
+
+    yaml_implicit_resolvers = _resolvers(yaml.SafeDumper)
+
+
+def _construct_sequence(loader: Any, node: Any) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)
+
+
+def _construct_mapping(loader: Any, node: Any) -> dict[str, Any]:
+    return dict(*_construct_sequence(loader, node))
+
+
+for _class in (_Loader, _Dumper):
+    _class.add_implicit_resolver(_FLOAT, re.compile(rf"(?:{_NUMBER.pattern})\Z"), list("-+0123456789."))
+_Loader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _construct_mapping)
+_Loader.add_constructor(f"{_PYTHON}/tuple", _construct_sequence)
+
+
+def load(text: str, where: str) -> Any:
+    """
+    Read a YAML document of plain values.
+
+    :param where: the file or the argument, for the error
+    :raises ValueError: if it is not one
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except (yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{where} is not YAML of plain values: {' '.join(str(error).split())}") from error
+
+
+def dump(value: Any, **options: Any) -> str:
+    """
+    Write plain values so that :func:`load` gives them back.
+
+    :param options: of ``yaml.dump``
+    """
+    return yaml.dump(value, Dumper=_Dumper, **options)
+
+
+def read_notation(text: str) -> Any:
+    """
+    Read RL Zoo's Python notation: literals, ``dict(key=value)``, and dotted names, which stay texts (``nn.ReLU``).
+
+    :raises ValueError: for anything else
+    """
+    try:
+        return _literal(ast.parse(text.strip(), mode="eval").body)
+    except (SyntaxError, RecursionError, MemoryError) as error:
+        raise ValueError(f"it is not a Python literal: {text!r}") from error
+
+
+def _literal(node: ast.expr) -> Any:
+    match node:
+        case ast.Constant(value=None | bool() | int() | float() | str()):
+            return node.value
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=ast.Constant(value=int() | float() as number)):
+            return -number if isinstance(node.op, ast.USub) else number
+        case ast.List() | ast.Tuple():
+            return [_literal(item) for item in node.elts]
+        case ast.Dict() if all(isinstance(key, ast.Constant) for key in node.keys):
+            keys = [_literal(key) for key in node.keys if key is not None]
+            return dict(zip(keys, map(_literal, node.values), strict=True))
+        case ast.Call(func=ast.Name(id="dict"), args=[]) if all(keyword.arg for keyword in node.keywords):
+            return {keyword.arg: _literal(keyword.value) for keyword in node.keywords}
+        case ast.Name() | ast.Attribute(value=ast.Name() | ast.Attribute()):
+            return ast.unparse(node)
+    raise ValueError(f"{ast.unparse(node)!r} is neither a literal nor dict(key=literal)")
