@@ -1,5 +1,6 @@
 """Figures of the paper: functions that draw arrays on axes of matplotlib, and read no file."""
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,6 +32,11 @@ class Curve:
     unfinished: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
 
+def wrap(label: str, width: int) -> str:
+    """Break a long label into at most three lines; what is cut off is in the caption of the figure."""
+    return "\n".join(textwrap.wrap(label, width, max_lines=3, placeholder=" …"))
+
+
 def count_seeds(n: int, unfinished: int = 0) -> str:
     """``"3 seeds, 1 unfinished"``."""
     text = "1 seed" if n == 1 else f"{n} seeds"
@@ -50,7 +56,7 @@ def draw_curves(axes: Any, curves: Sequence[Curve], title: str, ylabel: str, log
         for values, style in ((curve.values, "-"), (curve.unfinished, ":")):
             for run in values:
                 axes.plot(*_finite(curve.steps, run), style, color=curve.color, lw=0.7, alpha=0.45)
-        label = f"{curve.label} · {count_seeds(len(curve.values), len(curve.unfinished))}"
+        label = f"{wrap(curve.label, 44)} · {count_seeds(len(curve.values), len(curve.unfinished))}"
         values = np.log(curve.values) if log else curve.values
         mean, low, high = (np.exp(v) if log else v for v in mean_interval(values))
         axes.plot(*_finite(curve.steps, mean), color=curve.color, lw=1.8, label=label)
@@ -85,7 +91,8 @@ def draw_box_plots(
     for position, color, r in zip(positions, colors, returns, strict=True):
         axes.scatter(np.full(len(r), position), r.mean(axis=1), color=color, edgecolor="black", lw=0.6, s=22, zorder=3)
     style_axes(axes, title, "", f"return of {returns[0].shape[1]} test episodes a run")
-    ticks = [f"{label}\n{count_seeds(len(r))}" for label, r in zip(labels, returns, strict=True)]
+    width = max(10, 60 // max(len(labels), 1))
+    ticks = [f"{wrap(label, width)}\n{count_seeds(len(r))}" for label, r in zip(labels, returns, strict=True)]
     axes.set_xticks(positions, ticks, fontsize="small")
     axes.grid(visible=False, axis="x")
 
@@ -128,7 +135,7 @@ def draw_intervals(
         axes.plot([low, high], [row, row], color=color, lw=6, alpha=0.3, solid_capstyle="butt")
         axes.plot(point, row, "o", color=color)
     style_axes(axes, title, xlabel, "")
-    axes.set_yticks(range(len(labels)), labels)
+    axes.set_yticks(range(len(labels)), ["\n".join(wrap(line, 22) for line in label.split("\n")) for label in labels])
     axes.set_ylim(len(labels) - 0.5, -0.5)
 
 

@@ -21,7 +21,7 @@ from experiments import figures, provenance, statistics, tables
 from experiments.results import Group, Run, find_runs, group_runs, vary
 from experiments.suites import ISAAC, MUJOCO, PYBULLET
 from experiments.test_returns import EPISODES, read_test_returns
-from sb3_tdc.arguments import Parser
+from sb3_tdc.arguments import Parser, check_writable
 from sb3_tdc.experiment import ALGORITHMS
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 
@@ -458,7 +458,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         runs, unreadable = find_runs(args.logs)
     except ValueError as error:
         parser.fail(error)
-    path = write_report(runs, unreadable, args.output or args.logs / "report")
+    folder = args.output or args.logs / "report"
+    try:
+        check_writable("-o", folder / "report.html")
+    except ValueError as error:
+        parser.fail(error)
+    path = write_report(runs, unreadable, folder)
     print(f"Wrote {path}, with figures/ and tables/ beside it")
     return 0
 

@@ -3,6 +3,7 @@
 import inspect
 import json
 import zipfile
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -54,12 +55,27 @@ class Run:
         try:
             args, config = folder.args, folder.config
             changed = {key: args[key] for key, default in _ARGUMENTS.items() if args.get(key, default) != default}
-            run = cls(folder, args["algo"], args["env"], args["seed"], _flatten({**config, **changed}))
+            run = cls(
+                folder,
+                args["algo"],
+                args["env"],
+                args["seed"],
+                _flatten({**config, "n_timesteps": folder.n_timesteps, **changed}),
+            )
             run.n_timesteps  # noqa: B018  # must be there
         except (OSError, KeyError, TypeError, AttributeError) as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise ValueError(f"{path} has no readable config.yml and args.yml ({reason})") from error
+        run._read_all()
         return run
+
+    def _read_all(self) -> None:
+        """:raises ValueError: if a file is truncated or damaged"""
+        try:
+            _ = self.is_finished, self.evaluations, self.steps, self.system
+        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise ValueError(f"{self.folder.path} has a file that cannot be read ({reason})") from error
 
     def setting(self, key: str) -> Any:
         """:return: a hyperparameter, or what is taken where none is given"""
@@ -68,21 +84,20 @@ class Run:
     @property
     def n_timesteps(self) -> int:
         """Environment steps the run was to take."""
-        return self.settings["n_timesteps"]
+        return self.folder.n_timesteps
 
     @cached_property
     def steps(self) -> int:
         """Environment steps it has taken, as far as its files tell."""
         if self.folder.model.is_file():
-            with zipfile.ZipFile(self.folder.model) as archive:
-                return int(json.loads(archive.read("data"))["num_timesteps"])
+            return self.folder.steps_of_model()
         progress = self.progress("time/total_timesteps")
         logged = progress[-1] if len(progress) else 0
         return int(max(logged, self.evaluations.timesteps[-1] if self.evaluations else 0))
 
-    @property
+    @cached_property
     def is_finished(self) -> bool:
-        return self.folder.model.is_file() and self.steps >= self.n_timesteps
+        return self.folder.is_finished
 
     @cached_property
     def evaluations(self) -> Evaluations | None:

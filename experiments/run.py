@@ -3,6 +3,7 @@
 import argparse
 import heapq
 import importlib
+import shlex
 import sys
 import tempfile
 import time
@@ -303,7 +304,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("To go on: the same command", file=sys.stderr)
         return 130
     for folder in dict.fromkeys(args.logs / job.logs.relative_to(args.logs.resolve()).parts[0] for job in plan.jobs):
-        print(f"To look at them: python -m experiments.report {folder}")
+        print(f"To look at them: python -m experiments.report {shlex.quote(str(folder))}")
     return int(bool(outcome.failed))
 
 

@@ -5,8 +5,11 @@ Episode i begins with the evaluation seed 10,000 + i in every run, so that algor
 """
 
 import hashlib
+import importlib
 import os
 import sys
+import zipfile
+import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,8 +20,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from experiments.results import Run, find_runs
-from sb3_tdc.arguments import Parser
-from sb3_tdc.experiment import ALGORITHMS, make_envs
+from experiments.suites import PACKAGES
+from sb3_tdc.arguments import Parser, add_package_argument
+from sb3_tdc.experiment import ALGORITHMS, check_env_id, make_envs
 from sb3_tdc.hyperparams import parse
 from sb3_tdc.safe_load import load_safely
 
@@ -59,14 +63,18 @@ def read_test_returns(run: Run) -> np.ndarray | None:
     path = run.folder.path / FILE
     if not path.is_file() or not run.folder.model.is_file():
         return None
-    with np.load(path) as saved:
-        return saved["returns"] if str(saved["checksum"]) == checksum(run) else None
+    try:
+        with np.load(path) as saved:
+            return saved["returns"] if str(saved["checksum"]) == checksum(run) else None
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):  # played again
+        return None
 
 
-def measure_run(run: Run, episodes: int = EPISODES) -> np.ndarray:
+def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()) -> np.ndarray:
     """
     Play the episodes and keep their returns, unless they are kept already.
 
+    :param packages: those that a run may import, to register its environment
     :return: (episodes,)
     :raises ValueError: if the run cannot be loaded
     """
@@ -74,8 +82,13 @@ def measure_run(run: Run, episodes: int = EPISODES) -> np.ndarray:
     if kept is not None and len(kept) >= episodes:
         return kept[:episodes]
     before = checksum(run)
-    hyperparams = parse(run.folder.config, ALGORITHMS[run.algo], str(run.folder.path))
     args = run.folder.args
+    for package in args.get("gym_packages") or []:
+        if package not in (*packages, *PACKAGES.values()):
+            raise ValueError(f"it asks for the package {package}: if you know it, add --gym-packages {package}")
+        importlib.import_module(package)
+    check_env_id(run.env_id)
+    hyperparams = parse(run.folder.config, ALGORITHMS[run.algo], str(run.folder.path))
     normalization = run.folder.normalization(run.folder.model) if hyperparams.normalize is not None else None
     env = make_envs(
         run.env_id,
@@ -103,6 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser("Play test episodes with every finished run; what has been played is not played again.")
     parser.add_argument("logs", type=Path, help="folder of runs")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes for each run")
+    add_package_argument(parser)
     args = parser.parse_args(argv)
     if args.episodes < 1:
         parser.fail(ValueError(f"--episodes must be at least 1, got {args.episodes}"))
@@ -116,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"{run.folder.path}: left out, at step {run.steps:,} of {run.n_timesteps:,}")
             continue
         try:
-            returns = measure_run(run, args.episodes)
+            returns = measure_run(run, args.episodes, args.gym_packages)
         except Exception as error:  # one run must not stop the others
             failed.append(f"{run.folder.path}: {type(error).__name__}: {' '.join(str(error).split())}")
             continue

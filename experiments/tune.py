@@ -10,7 +10,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pandas as pd
 
@@ -20,7 +19,7 @@ from experiments.results import Run
 from experiments.search_space import LAMBDAS, make_candidates, parse_space
 from sb3_tdc import plain_yaml
 from sb3_tdc.arguments import KeyValues, Parser, add_package_argument, import_packages, one_of, plain_arguments
-from sb3_tdc.experiment import ALGORITHMS, check_env_id
+from sb3_tdc.experiment import ALGORITHMS, SETUP_ERRORS, check_env_id, make_envs
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
 from sb3_tdc.run_folder import folder_name
 
@@ -174,7 +173,7 @@ def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
     )
     axes.set_ylabel(f"mean return until step {shortest * eval_freq(job.n_timesteps):,}")
     for suffix in (".png", ".pdf"):
-        figure.savefig(path.with_suffix(suffix))
+        figure.savefig(f"{path}{suffix}")
 
 
 def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> None:
@@ -265,12 +264,12 @@ def _check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
     """:raises ValueError: if the algorithm does not take them"""
     entry, _ = read_entry(hyperparams_file(algo), env_id)
     parse({"n_timesteps": 1, **settings}, ALGORITHMS[algo], "--search and -params")
-    model = parse({**entry, **settings}, ALGORITHMS[algo], "--search and -params").model
-    with closing(gym.make(env_id)) as env:
-        try:
-            ALGORITHMS[algo](env=env, device="cpu", **{**model, "buffer_size": 1_000})
-        except (ValueError, AssertionError, TypeError) as error:
-            raise ValueError(f"--search and -params: {' '.join(str(error).split())}") from error
+    hyperparams = parse({**entry, **settings}, ALGORITHMS[algo], "--search and -params")
+    try:
+        with closing(make_envs(env_id, hyperparams, seed=1, n_envs=hyperparams.n_envs)) as env:
+            ALGORITHMS[algo](env=env, device="cpu", **{**hyperparams.model, "buffer_size": 1_000})
+    except SETUP_ERRORS as error:
+        raise ValueError(f"--search and -params: {' '.join(str(error).split())}") from error
 
 
 def make_trials(

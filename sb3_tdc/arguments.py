@@ -12,6 +12,9 @@ import torch as th
 from sb3_tdc import plain_yaml
 from sb3_tdc.hyperparams import suggest
 
+# NumPy takes no seed above 2**32, and environments are seeded with this one and a little more
+MAX_SEED = 2**31 - 1
+
 
 class Parser(argparse.ArgumentParser):
     """
@@ -79,6 +82,23 @@ class Names(argparse.Action):
 def _given_before(namespace: argparse.Namespace, action: argparse.Action, kind: type) -> Any:
     value = getattr(namespace, action.dest, None)
     return value if isinstance(value, kind) and value is not action.default else kind()
+
+
+def check_writable(flag: str, path: Path) -> None:
+    """
+    Make the folder of a file that will be written.
+
+    :raises ValueError: if it cannot be written
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        existed = path.exists()
+        with path.open("ab"):
+            pass
+        if not existed:
+            path.unlink()
+    except OSError as error:
+        raise ValueError(f"{flag} {path} cannot be written: {error.strerror}") from error
 
 
 def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:

@@ -15,11 +15,18 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tdc.arguments import Parser, add_common_arguments, apply_common_arguments, import_packages
+from sb3_tdc.arguments import (
+    MAX_SEED,
+    Parser,
+    add_common_arguments,
+    apply_common_arguments,
+    check_writable,
+    import_packages,
+)
 from sb3_tdc.experiment import ALGORITHMS, SETUP_ERRORS, check_env_id, load_model, make_envs
 from sb3_tdc.explain import play_episodes, steps_until_negligible, write_explanation
 from sb3_tdc.hyperparams import Hyperparams, parse
-from sb3_tdc.rendering import VideoWriter, choose_gl_backend, display_works, follow_agent, render_modes
+from sb3_tdc.rendering import VIDEO_SUFFIXES, VideoWriter, choose_gl_backend, display_works, follow_agent, render_modes
 from sb3_tdc.run_folder import RunFolder
 from sb3_tdc.tdc import TDC
 
@@ -258,7 +265,22 @@ def explain(model: TDC, env: VecEnv, trained: Trained, n_episodes: int, limit: i
         f"TDC on {trained.env_id}, {model.num_timesteps:,} steps of training ({trained.path.name}), "
         f"{unit}λ = {model._scheduled('lam'):g}, γ = {model.gamma:g}"
     )
-    write_explanation(model, episodes, trained.path.with_name(f"{trained.path.stem}_critics"), title)
+    write_explanation(model, episodes, _explanation(trained), title)
+
+
+def _explanation(trained: Trained) -> Path:
+    """Return the files of ``--explain``, without their endings."""
+    return trained.path.with_name(f"{trained.path.stem}_critics")
+
+
+def _check_outputs(args: argparse.Namespace, trained: Trained) -> None:
+    """:raises ValueError: if what is asked for cannot be written, before anything is played"""
+    if args.explain:
+        check_writable("--explain:", Path(f"{_explanation(trained)}.png"))
+    if args.record is not None:
+        if args.record.suffix not in VIDEO_SUFFIXES:
+            raise ValueError(f"--record {args.record}: the name must end in one of {', '.join(VIDEO_SUFFIXES)}")
+        check_writable("--record", args.record)
 
 
 def _make_env(trained: Trained, args: argparse.Namespace, env_kwargs: dict[str, Any]) -> VecEnv:
@@ -283,10 +305,13 @@ def _run(args: argparse.Namespace) -> int:
     args.env = import_packages(args, args.env)  # perhaps with its package, as train.py takes it
     if args.trust:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
+    if not 0 <= args.seed <= MAX_SEED:
+        raise ValueError(f"--seed must be 0 to {MAX_SEED}, got {args.seed}")
     trained = find_trained(args)
     check_env_id(trained.env_id)
     set_random_seed(args.seed)
     env_kwargs = {**trained.env_kwargs, **args.env_kwargs}
+    _check_outputs(args, trained)
     if args.explain:
         check_explainable(args, trained)
         limit, env_kwargs = extend_time_limit(trained, env_kwargs)

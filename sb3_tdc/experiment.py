@@ -3,6 +3,7 @@
 import difflib
 import shutil
 import sys
+import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -26,7 +27,6 @@ from stable_baselines3.common.logger import (
 )
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -36,15 +36,16 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_tdc.busy_machine import BusyMachine
-from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, Restorable, stored_steps
+from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, LockedError, NotRestoredError, Restorable, stored_steps
 from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.finite_guard import FiniteGuard, check_weights, divergence_named
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.interruption import StopOnSignal, ended_processes, ignore_signals
+from sb3_tdc.mujoco_messages import say_warnings_once
 from sb3_tdc.progress import ProgressCallback
-from sb3_tdc.run_folder import RunFolder, save
+from sb3_tdc.run_folder import RunFolder, make_numbered, save
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely, read_data
-from sb3_tdc.tdc import TDC
+from sb3_tdc.tdc import TDC, NonFiniteError
 
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "td3": TD3, "sac": SAC, "ddpg": DDPG}
 
@@ -99,6 +100,10 @@ class Experiment:
 
 class NotSavedError(Exception):
     """A trained model that cannot be written, with the reason in one sentence."""
+
+
+class TrainingError(Exception):
+    """Training that an environment, a wrapper or a callback ended: the step and the reason in one sentence."""
 
 
 class SetupError(ValueError):
@@ -162,6 +167,7 @@ def make_envs(
     def make_env(**kwargs: Any) -> gym.Env:  # Monitor comes around it: it must see the ends of the wrapped episodes
         if vec_env == "subproc":
             ignore_signals()
+        say_warnings_once()
         env = spec.make(**kwargs)
         for wrapper in hyperparams.env_wrapper:
             env = wrapper(env)
@@ -202,6 +208,7 @@ def train(experiment: Experiment) -> Outcome:
 
     :raises SetupError: if the run cannot begin; its folder is removed, if it was made for it
     :raises NonFiniteError: if training diverged; saved models stay as they are
+    :raises TrainingError: if an environment or a callback raised; the folder has the traceback
     :raises NotSavedError: if the trained model cannot be written
     :raises LockedError: if another process has begun to write to the folder
     """
@@ -238,17 +245,42 @@ def train(experiment: Experiment) -> Outcome:
             raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
         stack.callback(progress.close)
         with stop, divergence_named(model):
-            model.learn(
-                experiment.hyperparams.n_timesteps,
-                callback=callbacks,
-                log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
-            )
+            _learn(experiment, model, callbacks)
             _save(experiment, model)
         if not stop.requested:
             experiment.folder.mark_finished(model.num_timesteps)
             if checkpoints is not None:
                 checkpoints.store.remove_all()
         return Outcome(model, stop.requested, checkpoints.last_step if checkpoints is not None else None)
+
+
+def _learn(experiment: Experiment, model: OffPolicyAlgorithm, callbacks: list[BaseCallback]) -> None:
+    try:
+        model.learn(
+            experiment.hyperparams.n_timesteps,
+            callback=callbacks,
+            log_interval=experiment.log_interval,  # type: ignore[arg-type]  # None is none
+        )
+    except (NonFiniteError, NotRestoredError, LockedError):
+        raise
+    except Exception as error:
+        reason = _describe_death(model) or f"{type(error).__name__}: {' '.join(str(error).split())}"
+        if model.num_timesteps == 0 and not experiment.resume:
+            shutil.rmtree(experiment.folder.path)
+            raise SetupError(f"{experiment.env_id} failed before the first step: {reason}") from error
+        experiment.folder.write_error(traceback.format_exc())
+        raise TrainingError(f"Training failed at step {model.num_timesteps:,}: {reason}") from error
+
+
+def _describe_death(model: OffPolicyAlgorithm) -> str:
+    """Return which process of an environment has died, if any: all that is left of it here is a closed pipe."""
+    processes = getattr(model.env.unwrapped, "processes", []) if model.env is not None else []
+    for i, process in enumerate(processes):
+        process.join(timeout=0.5)
+        if process.exitcode is not None:
+            cause = f"by signal {-process.exitcode}" if process.exitcode < 0 else "its own message is above"
+            return f"the process of environment {i} has died ({cause})"
+    return ""
 
 
 def _remedy(experiment: Experiment) -> str:
@@ -394,8 +426,7 @@ def _make_logger(experiment: Experiment) -> Logger:
         writers.append(TensorBoardOutputFormat(str(folder)))
     elif experiment.tensorboard_log:
         parent = Path(experiment.tensorboard_log) / experiment.folder.env_name
-        name = experiment.algo.upper()
-        writers.append(TensorBoardOutputFormat(str(parent / f"{name}_{get_latest_run_id(str(parent), name) + 1}")))
+        writers.append(TensorBoardOutputFormat(str(make_numbered(parent, experiment.algo.upper()))))
     if experiment.verbose > 1:
         writers.append(HumanOutputFormat(sys.stdout))
     return Logger(str(folder), writers)

@@ -337,12 +337,12 @@ def write_explanation(model: TDC, episodes: Sequence[Episode], stem: Path, title
     """Write the figure as PNG and PDF, and print what it shows in numbers."""
     figure = make_figure(episodes, title, describe_play(model))
     for suffix in (".png", ".pdf"):
-        figure.savefig(stem.with_suffix(suffix), dpi=150)
+        figure.savefig(f"{stem}{suffix}", dpi=150)
     for name, value in summarise(episodes).items():
         print(f"{name.replace('_', ' ').capitalize()}: {value:.4g} ({_count(episodes)})")
     if not summarise(episodes):
         print("No discounted return is known: the episodes end by a time limit before the discount has faded.")
-    print(f"Wrote {stem.with_suffix('.png')} and .pdf")
+    print(f"Wrote {stem}.png and .pdf")
 
 
 def _count(episodes: Sequence[Episode]) -> str:

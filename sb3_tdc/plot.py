@@ -1,6 +1,8 @@
 """``python -m sb3_tdc.plot RUN [RUN ...]``: learning curves of runs, from their evaluations."""
 
 import sys
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tdc.arguments import Parser
+from sb3_tdc.arguments import Parser, check_writable
 from sb3_tdc.run_folder import RunFolder
 
 
@@ -34,10 +36,12 @@ def load_curve(run: RunFolder) -> Curve:
     if not path.is_file():
         raise ValueError(f"{path} does not exist: the run has not been evaluated yet")
     args = run.args
-    with np.load(path) as evaluations:
-        return Curve(
-            f"{args['algo']}, seed {args['seed']}", args["env"], evaluations["timesteps"], evaluations["results"]
-        )
+    try:
+        with np.load(path) as evaluations:
+            timesteps, returns = evaluations["timesteps"], evaluations["results"]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    return Curve(f"{args['algo']}, seed {args['seed']}", args["env"], timesteps, returns)
 
 
 def draw_curves(axes: Any, curves: Sequence[Curve]) -> None:
@@ -76,6 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("curve.png"), help="file (.png, .svg, .pdf)")
     args = parser.parse_args(argv)
     try:
+        check_writable("-o", args.output)
         curves = [load_curve(RunFolder.open(run)) for run in args.runs]
         if len({curve.env_id for curve in curves}) > 1:
             raise ValueError("The runs must be of one environment; draw one figure for each")
@@ -87,8 +92,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.fail(ImportError('Plots need matplotlib: pip install "sb3-tdc[plot]"'))
 
     figure = Figure(figsize=(7, 4), layout="constrained")
+    kinds = sorted(figure.canvas.get_supported_filetypes())
+    if args.output.suffix.removeprefix(".") not in kinds:
+        parser.fail(ValueError(f"-o {args.output}: the name must end in one of .{', .'.join(kinds)}"))
     draw_curves(figure.subplots(), curves)
-    args.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(args.output, dpi=150)
     print(f"Wrote {args.output}")
     return 0

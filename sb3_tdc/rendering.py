@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
+VIDEO_SUFFIXES = (".mp4", ".gif", ".webm", ".mkv", ".mov", ".avi")
 _GL_BACKENDS = ("egl", "osmesa")
 _TRY_DISPLAY = "import sys, glfw; sys.exit(not glfw.init())"
 _TRY_BACKEND = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
@@ -95,7 +96,6 @@ class VideoWriter:
             import imageio_ffmpeg  # noqa: F401
         except ImportError as error:
             raise ImportError('Recording needs imageio and ffmpeg: pip install "sb3-tdc[video]"') from error
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.writer: Any = imageio.get_writer(path, fps=fps)
 
     def add(self, frame: np.ndarray) -> None:

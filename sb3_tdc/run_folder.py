@@ -1,11 +1,15 @@
 """Where a run keeps its files: RL Zoo's layout, ``logs/tdc/Walker2d-v4_1/…``."""
 
+import json
 import os
 import re
 import shlex
 import sys
 import uuid
+import zipfile
+import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,17 +41,9 @@ class RunFolder:
         :param unique: append a UUID to the name
         """
         env_name, parent = folder_name(env_id), Path(log_folder) / algo
-        parent.mkdir(parents=True, exist_ok=True)
-        number = max(_numbered(parent, env_name), default=0) + 1
-        while True:
-            path = parent / f"{env_name}_{number}{f'_{uuid.uuid4()}' if unique else ''}"
-            try:
-                path.mkdir()
-            except FileExistsError:
-                number += 1
-                continue
-            (path / env_name).mkdir()
-            return cls(path, env_name)
+        path = make_numbered(parent, env_name, f"_{uuid.uuid4()}" if unique else "")
+        (path / env_name).mkdir()
+        return cls(path, env_name)
 
     @classmethod
     def find(cls, log_folder: str | Path, algo: str, env_id: str, number: int = 0) -> "RunFolder":
@@ -101,6 +97,16 @@ class RunFolder:
         return self.path / "checkpoints"
 
     @property
+    def error(self) -> Path:
+        """The traceback of what ended training."""
+        return self.path / self.env_name / "error.txt"
+
+    def write_error(self, text: str) -> None:
+        """Keep a traceback, if there is room for it."""
+        with suppress(OSError):
+            _write_text(self.error, text)
+
+    @property
     def command_to_resume(self) -> str:
         return f"python train.py --resume {shlex.quote(str(self.path))}"
 
@@ -112,8 +118,35 @@ class RunFolder:
         return has_rows or any(self.path.glob("*.zip")) or (self.path / "evaluations.npz").is_file()
 
     @property
+    def n_timesteps(self) -> int:
+        """Environment steps that the run was to take; RL Zoo leaves those of ``-n`` out of its hyperparameters."""
+        given = self.args.get("n_timesteps", -1)
+        return int(given if isinstance(given, int) and given > 0 else self.config["n_timesteps"])
+
+    @property
     def is_finished(self) -> bool:
-        return self._finished.is_file()
+        """
+        Whether training came to its end, which a callback may have set; after an interruption it has not.
+
+        :raises ValueError: if its model cannot be read
+        """
+        if self._finished.is_file():
+            return True
+        # RL Zoo does not say: its run is finished if the model has all steps
+        is_of_rl_zoo = "checkpoint_freq" not in self.args
+        return is_of_rl_zoo and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
+
+    def steps_of_model(self) -> int:
+        """
+        Return the environment steps that the last model was trained for.
+
+        :raises ValueError: if it cannot be read
+        """
+        try:
+            with zipfile.ZipFile(self.model) as archive:
+                return int(json.loads(archive.read("data"))["num_timesteps"])
+        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"{self.model} cannot be read ({type(error).__name__}: {error})") from error
 
     @property
     def _finished(self) -> Path:
@@ -175,6 +208,20 @@ class RunFolder:
         _write_text(folder / "args.yml", plain_yaml.dump(args))
         about = {**library_versions(), "sb3_tdc": commit_of_the_code() or "a wheel", "processor": processor_name()}
         _write_text(folder / "versions.yml", plain_yaml.dump(about))
+
+
+def make_numbered(parent: Path, name: str, suffix: str = "") -> Path:
+    """Make the folder ``<name>_<next number>``, and only this process: two that start at once get one each."""
+    parent.mkdir(parents=True, exist_ok=True)
+    number = max(_numbered(parent, name), default=0) + 1
+    while True:
+        path = parent / f"{name}_{number}{suffix}"
+        try:
+            path.mkdir()
+        except FileExistsError:
+            number += 1
+        else:
+            return path
 
 
 def save(save_as: Callable[[Path], Any], path: Path) -> None:

@@ -16,9 +16,18 @@ import numpy as np
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc import plain_yaml
-from sb3_tdc.arguments import KeyValues, Parser, add_common_arguments, apply_common_arguments, plain_arguments
+from sb3_tdc.arguments import MAX_SEED, KeyValues, Parser, add_common_arguments, apply_common_arguments, plain_arguments
 from sb3_tdc.checkpoint import DEFAULT_FREQ, LockedError, NotRestoredError, stored_steps
-from sb3_tdc.experiment import ALGORITHMS, Experiment, NotSavedError, Outcome, SetupError, check_env_id, train
+from sb3_tdc.experiment import (
+    ALGORITHMS,
+    Experiment,
+    NotSavedError,
+    Outcome,
+    SetupError,
+    TrainingError,
+    check_env_id,
+    train,
+)
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.output import harmless_output
 from sb3_tdc.run_folder import RunFolder
@@ -120,8 +129,10 @@ def make_experiment(args: argparse.Namespace) -> Experiment:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(args, name)}")
     if args.trained_agent is not None and not (args.trained_agent.suffix == ".zip" and args.trained_agent.is_file()):
         raise ValueError(f"-i must be the zip of a model, got {args.trained_agent}")
+    if not -1 <= args.seed <= MAX_SEED:
+        raise ValueError(f"--seed must be 0 to {MAX_SEED} (or -1: a random one), got {args.seed}")
     if args.seed < 0:
-        args.seed = int(np.random.randint(2**31 - 1))
+        args.seed = int(np.random.randint(MAX_SEED))
     hyperparams = read_hyperparams(args)
     vars(args).update(_absolute(vars(args)))
     folder = _make_folder(args, hyperparams)
@@ -284,8 +295,10 @@ def _main(argv: Sequence[str] | None) -> int:
         outcome = train(experiment)
     except (SetupError, NotRestoredError) as error:
         parser.fail(error)
-    except (NotSavedError, LockedError) as error:
+    except (TrainingError, NotSavedError, LockedError) as error:
         print(error, file=sys.stderr)
+        if isinstance(error, TrainingError):
+            print(f"The traceback is in {folder.error}", file=sys.stderr)
         if stored_steps(folder.checkpoint_folder):
             print(f"To continue from the newest checkpoint:\n  {folder.command_to_resume}", file=sys.stderr)
         return 1
@@ -303,7 +316,7 @@ def _main(argv: Sequence[str] | None) -> int:
         return 130
     if args.verbose > 0:
         packages = f" --gym-packages {shlex.join(args.gym_packages)}" if args.gym_packages else ""
-        print(f"To watch it: python enjoy.py {folder.path}{packages}")
+        print(f"To watch it: python enjoy.py {shlex.quote(str(folder.path))}{packages}")
     return 0
 
 

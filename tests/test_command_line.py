@@ -461,3 +461,90 @@ def test_enjoy_finds_what_train_made_of_an_environment_with_its_package(tmp_path
         assert run_enjoy("--env", "in_package:InPackage-v0", "-f", tmp_path) == 0
     finally:
         sys.path.remove(str(tmp_path))
+
+
+@pytest.mark.parametrize("seed", [2**31, 4294967296, -2])
+def test_a_seed_out_of_range_leaves_no_folder(tmp_path, seed, capsys):
+    with pytest.raises(SystemExit):
+        run_train(tmp_path, seed=seed)
+    assert f"--seed must be 0 to 2147483647 (or -1: a random one), got {seed}" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def spaced(tmp_path_factory):
+    """A run in a folder with a space in its name."""
+    folder = tmp_path_factory.mktemp("with space") / "my [runs] here"
+    assert run_train(folder, n=120) == 0
+    return folder / "tdc" / "Hopper-v4_1"
+
+
+def test_commands_that_are_printed_can_be_pasted(tmp_path, capsys):
+    folder = tmp_path / "my runs"
+    run_train(folder, n=120)
+    command = capsys.readouterr().out.rpartition("To watch it: python enjoy.py ")[2]
+    assert run_enjoy(*shlex.split(command)) == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"),
+    [
+        (["--record", "{file}/a.mp4"], "--record {file}/a.mp4 cannot be written: "),
+        (["--record", "{folder}/a.xyz"], "the name must end in one of .mp4, "),
+        (["--record", "{folder}"], "the name must end in one of .mp4, "),
+        (["--seed", "-1"], "--seed must be 0 to 2147483647, got -1"),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_anything_is_played(spaced, tmp_path, flags, reason, capsys):
+    (tmp_path / "file").write_text("")
+    places = {"file": tmp_path / "file", "folder": tmp_path}
+    with pytest.raises(SystemExit) as exit_:
+        enjoy.main([str(spaced), "--no-render", *(flag.format(**places) for flag in flags)])
+    assert exit_.value.code == 2
+    captured = capsys.readouterr()
+    assert reason.format(**places) in captured.err
+    assert "Episode" not in captured.out
+
+
+def test_a_log_folder_that_is_a_file(tmp_path, capsys):
+    (tmp_path / "logs").write_text("mine")
+    with pytest.raises(SystemExit):
+        run_train(tmp_path / "logs")
+    assert f"No run folder can be made in {tmp_path / 'logs'}" in capsys.readouterr().err
+    assert (tmp_path / "logs").read_text() == "mine"
+
+
+def test_two_runs_never_share_a_tensorboard_folder(tmp_path):
+    board = tmp_path / "my [board]"
+    (board / "Hopper-v4" / "TDC_1").mkdir(parents=True)  # of a run that has started at the same moment
+    for number in (2, 3):
+        assert run_train(tmp_path, "-tb", board, n=120) == 0
+        assert len(list((board / "Hopper-v4" / f"TDC_{number}").iterdir())) == 1
+    assert list((board / "Hopper-v4" / "TDC_1").iterdir()) == []
+
+
+def test_an_explanation_is_named_after_its_model(spaced, tmp_path):
+    model = spaced / "toy_v1.2.zip"
+    model.write_bytes((spaced / "Hopper-v4.zip").read_bytes())
+    assert enjoy.main([str(model), "--explain", "--n-episodes", "1"]) == 0
+    assert (spaced / "toy_v1.2_critics.png").is_file()
+
+
+def test_mujoco_says_a_warning_once_and_leaves_no_file(tmp_path):
+    code = """
+import gymnasium as gym, numpy as np
+from sb3_tdc.mujoco_messages import say_warnings_once
+say_warnings_once()
+for _ in range(3):
+    env = gym.make("HalfCheetah-v4")
+    env.reset(seed=1)
+    env.unwrapped.data.ctrl[:] = np.nan
+    for _ in range(3):
+        env.unwrapped.do_simulation(np.full(6, np.nan), 1)
+"""
+    options = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}}
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, **options)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr.count("The simulation is unstable") == 1
+    assert "settotalmass" not in ended.stderr
+    assert list(tmp_path.iterdir()) == []

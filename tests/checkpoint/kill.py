@@ -35,6 +35,7 @@ _CODE = """
 import faulthandler, signal, sys
 faulthandler.register(signal.SIGUSR1, open(sys.argv.pop(1), "w"))
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored below a job in the background of a shell
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and this one below nohup
 from sb3_tdc.train import main
 sys.exit(main())
 """

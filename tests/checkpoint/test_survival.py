@@ -184,11 +184,9 @@ class FailsInEvaluation(PendulumEnv):
 
 def test_an_error_of_a_simulator_in_an_evaluation_is_not_taken_for_a_full_disk(tmp_path, capsys):
     gym.register("FailsInEvaluation-v0", FailsInEvaluation, max_episode_steps=20)
-    try:
-        status = run_train(tmp_path, env="FailsInEvaluation-v0")
-    except ConnectionResetError:
-        status = 1
-    assert status == 1
+    assert run_train(tmp_path, env="FailsInEvaluation-v0") == 1
+    error = capsys.readouterr().err
+    assert "Training failed at step 150: ConnectionResetError: the simulator has gone\n" in error
     assert not (tmp_path / "tdc" / "FailsInEvaluation-v0_1" / "FailsInEvaluation-v0.zip").exists()
 
 
@@ -305,3 +303,96 @@ def test_a_clock_that_was_set_back_does_not_fold_the_curve(tmp_path, stop_at, mo
     folder = tmp_path / "tdc" / "Hopper-v4_1"
     assert resume(folder) == 0
     assert outcome(folder) == whole
+
+
+# ---------------------------------------------------------------- environments that fail
+
+
+class Raises(PendulumEnv):
+    """:param how: what goes wrong at step ``at`` of the process"""
+
+    def __init__(self, how="raise", at=250):
+        super().__init__()
+        self.how, self.at, self.count = how, at, 0
+
+    def reset(self, **kwargs):
+        if self.how == "reset":
+            raise RuntimeError("no scene\nto load")
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        self.count += 1
+        observation, reward, *rest = super().step(action)
+        if self.count < self.at:
+            return observation, reward, *rest
+        if self.how == "raise":
+            raise ZeroDivisionError("in the\nsimulator")
+        if self.how == "die":
+            os._exit(3)
+        if self.how == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return {
+            "shape": (np.zeros(5), reward, *rest),
+            "type": (np.array(["a", "b", "c"]), reward, *rest),
+            "none": None,
+            "no observation": (None, reward, *rest),
+            "no reward": (observation, None, *rest),
+            "four": (observation, reward, False, {}),
+        }[self.how]
+
+
+gym.register("Raises-v0", Raises, max_episode_steps=100)
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("raise", "Training failed at step 249: ZeroDivisionError: in the simulator"),
+        ("shape", "Training failed at step 249: ValueError: could not broadcast"),
+        ("type", "Training failed at step 249: "),
+        ("none", "Training failed at step 249: TypeError: "),
+        ("no observation", "non-finite observation"),
+        ("no reward", "Training failed at step 249: TypeError: float() argument"),
+        ("four", "Training failed at step 249: ValueError: not enough values to unpack"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_an_environment_that_fails_is_one_sentence_and_the_run_can_be_resumed(tmp_path, how, reason, capsys):
+    kwargs = ["--env-kwargs", f"how:{how}", "--eval-freq", -1]
+    assert run_train(tmp_path, *kwargs, env="Raises-v0") == 1
+    error = capsys.readouterr().err
+    folder = tmp_path / "tdc" / "Raises-v0_1"
+    assert reason in error
+    assert "Traceback" not in error
+    assert f"python train.py --resume {folder}" in error
+    assert not (folder / "Raises-v0.zip").exists()
+    if "Training failed" in error:
+        assert f"The traceback is in {folder / 'Raises-v0' / 'error.txt'}" in error
+        assert "Traceback" in (folder / "Raises-v0" / "error.txt").read_text()
+    assert stored_steps(folder / "checkpoints")[0] == 240
+    assert resume(folder, "--verbose", 0) == 1  # and again, ten steps later
+
+
+@pytest.mark.parametrize(
+    ("how", "cause"), [("raise", "its own message is above"), ("die", "its own"), ("killed", "by signal 9")]
+)
+def test_a_process_of_an_environment_that_dies_is_named(tmp_path, how, cause):
+    code = "import sys; import tests.checkpoint.test_survival; from sb3_tdc.train import main\n"
+    (tmp_path / "code.py").write_text(f"{code}if __name__ == '__main__': sys.exit(main())")
+    command = [sys.executable, "-W", "ignore", str(tmp_path / "code.py"), "--env", "Raises-v0", "-n", "400"]
+    command += ["-f", str(tmp_path), "--env-kwargs", f"how:{how}", "at:60", "--vec-env", "subproc", "--eval-freq", "-1"]
+    command += ["--checkpoint-freq", "40", "-params", "n_envs:2", "learning_starts:1000"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=90, env=environment, check=False)
+    assert ended.returncode == 1
+    last = ended.stderr[ended.stderr.index("Training failed") :]
+    assert "Training failed at step 118: the process of environment 0 has died" in last
+    assert cause in last
+    assert "Traceback" not in last
+    assert "--resume" in last
+
+
+def test_an_environment_that_fails_before_the_first_step_leaves_nothing(tmp_path, capsys):
+    error = fails(lambda: run_train(tmp_path, "--env-kwargs", "how:reset", env="Raises-v0"), capsys)
+    assert "no scene to load" in error
+    assert list((tmp_path / "tdc").iterdir()) == []

@@ -1,0 +1,27 @@
+"""MuJoCo's warnings: each once, on the screen alone."""
+
+import re
+import sys
+
+import mujoco
+
+
+def say_warnings_once() -> None:
+    """
+    Print every warning of MuJoCo in this process once, to standard error.
+
+    By itself it prints them each time, and appends them to MUJOCO_LOG.TXT in the working directory.
+    """
+    if hasattr(mujoco, "set_mju_user_warning"):
+        mujoco.set_mju_user_warning(_say)
+
+
+def _say(text: str) -> None:
+    kind = re.sub(r"\bTime = \S+", "", text)
+    # What is deprecated is in the files of gymnasium's tasks: nothing that a user could change
+    if kind not in _said and "is deprecated" not in text:
+        _said.add(kind)
+        print(f"MuJoCo: {text.strip()} (said once)", file=sys.stderr, flush=True)
+
+
+_said: set[str] = set()
