@@ -9,7 +9,7 @@ import yaml
 from matplotlib import figure
 
 from experiments import figures, report, tables, test_returns
-from experiments.results import find_runs, group_runs
+from experiments.results import Run, find_runs, group_runs
 from sb3_tdc import train
 from tests.experiments.test_results import make_run
 
@@ -97,6 +97,33 @@ def test_boxes_pool_episodes_and_dots_are_seeds():
     assert dots.get_offsets().tolist() == [[0, 1], [0, 7]]
     assert any(line.get_ydata().tolist() == [3, 3] for line in axes.lines)  # the median of all four
     assert "2 seeds" in axes.get_xticklabels()[0].get_text()
+
+
+LONG = "TDC, " + ", ".join(f"policy_kwargs.some_setting_{i} {i / 7}" for i in range(12))
+
+
+def test_long_labels_leave_the_axes_their_room():
+    """At least half of the figure's width and height."""
+    curve = figures.Curve(LONG, "blue", np.array([10, 20]), np.array([[1.0, 3.0]]))
+    cases = [
+        (figures.draw_curves, [curve, curve], "A", "return"),
+        (figures.draw_box_plots, [LONG] * 4, ["blue"] * 4, [np.arange(4.0)[None]] * 4, "A"),
+        (figures.draw_intervals, [f"{LONG}\n6 runs", "TD3\n6 runs"], ["blue"] * 2, [(0.5, 0.2, 0.8)] * 2, "A", "score"),
+    ]
+    for function, *args in cases:
+        drawn = figure.Figure(figsize=(4.8, 3.4), layout="constrained")
+        axes = drawn.subplots()
+        function(axes, *args)
+        drawn.draw_without_rendering()
+        assert axes.get_position().width > 0.5, function
+        assert axes.get_position().height > 0.5, function
+
+
+def test_the_caption_has_the_whole_label(tmp_path):
+    make_run(tmp_path, seed=1)
+    groups, labels = read_groups(tmp_path), [LONG]
+    picture = report.Report(groups, tmp_path).draw_learning_curves("name", groups, labels, ["blue"])
+    assert f"{LONG}: 1 (1)" in picture.caption
 
 
 def test_bins_scale_with_the_run_but_hold_an_evaluation(tmp_path):
@@ -193,6 +220,20 @@ def test_a_run_that_cannot_be_tested_does_not_stop_the_others(logs, capsys, monk
     captured = capsys.readouterr()
     assert captured.err.count("RuntimeError: no such luck") == 2
     assert captured.out.count("(7 episodes)") == 4
+
+
+def test_a_run_of_another_package_needs_its_name(tmp_path, monkeypatch):
+    code = "import gymnasium as gym\ngym.register('Elsewhere-v0', gym.spec('Pendulum-v1').entry_point)\n"
+    (tmp_path / "elsewhere_package.py").write_text(code)
+    folder = make_run(tmp_path, env_id="Elsewhere-v0", args={"gym_packages": ["elsewhere_package"]})
+    run = Run.open(folder.path)
+    with pytest.raises(ValueError, match=r"asks for the package elsewhere_package: .*--gym-packages elsewhere_package"):
+        test_returns.measure_run(run)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(test_returns, "load_safely", lambda *args, **kwargs: None)
+    monkeypatch.setattr(test_returns, "play_episodes", lambda model, env, episodes: np.ones(episodes))
+    run.folder.write_config(run.folder.config, {**run.folder.args, "env_kwargs": {}, "eval_env_kwargs": {}})
+    assert test_returns.measure_run(run, 3, ["elsewhere_package"]).tolist() == [1, 1, 1]
 
 
 def test_from_runs_to_a_page(logs, tmp_path, capsys):

@@ -129,3 +129,36 @@ def test_a_run_belongs_to_a_cell_by_lambda_and_head(tmp_path):
     assert Cell("tdc", "Hopper-v4", {"stochastic_actor": False}).includes(run)
     assert not Cell("tdc", "Hopper-v4", {"lam": 1.0}).includes(run)
     assert not Cell("td3", "Hopper-v4").includes(run)
+
+
+@pytest.mark.parametrize("name", ["evaluations.npz", "Hopper-v4.zip"])
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[: len(data) // 2], lambda data: b"", lambda data: b"x" * len(data)]
+)
+def test_a_damaged_file_is_listed_and_the_others_are_read(tmp_path, name, damage):
+    broken = make_run(tmp_path, seed=1, returns=np.ones((50, 5)))
+    make_run(tmp_path, seed=2)
+    (broken.path / name).write_bytes(damage((broken.path / name).read_bytes()))
+    runs, unreadable = find_runs(tmp_path)
+    assert [run.seed for run in runs] == [2]
+    assert len(unreadable) == 1
+    assert str(broken.path) in unreadable[0]
+
+
+def test_a_run_that_a_callback_ended_is_finished_for_all(tmp_path):
+    """``train.py`` marks its runs; how many steps they have does not matter then."""
+    folder = make_run(tmp_path, steps=400, args={"checkpoint_freq": 100})
+    assert not find_runs(tmp_path)[0][0].is_finished
+    folder.mark_finished(400)
+    (run,), _ = find_runs(tmp_path)
+    assert (run.is_finished, run.folder.is_finished, run.steps, run.n_timesteps) == (True, True, 400, 1000)
+    (group,) = group_runs([run])
+    assert group.finished == (run,)
+
+
+def test_a_run_of_rl_zoo_with_other_steps_on_its_command_line(tmp_path):
+    make_run(tmp_path, algo="sac", steps=300, args={"n_timesteps": 300})  # its config.yml says 1,000
+    make_run(tmp_path, algo="sac", seed=2, steps=300, args={"n_timesteps": -1})
+    runs, _ = find_runs(tmp_path)
+    assert [(run.n_timesteps, run.is_finished) for run in runs] == [(300, True), (1000, False)]
+    assert len(group_runs(runs)) == 2  # another number of steps is another experiment

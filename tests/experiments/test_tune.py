@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
@@ -178,3 +179,26 @@ def test_asha_stops_whole_candidates(tmp_path):
     assert len(finished) == 4
     assert all(n in (0, 2) for n in finished)
     assert 2 in finished
+
+
+class NeedsKwargs(gym.Env):
+    """Cannot be made by its id alone, and its wrapper changes what is observed."""
+
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, size):
+        self.observation_space = gym.spaces.Box(-1, 1, (size,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+
+def test_candidates_are_checked_on_the_environment_of_the_runs(monkeypatch):
+    gym.register("NeedsKwargs-v0", NeedsKwargs)
+    settings = {"env_kwargs": {"size": 3}, "env_wrapper": "gymnasium.wrappers.FlattenObservation"}
+    tune._check("tdc", "NeedsKwargs-v0", settings)
+    with pytest.raises(ValueError, match=r"--search and -params: .*size"):
+        tune._check("tdc", "NeedsKwargs-v0", {})
+    with pytest.raises(ValueError, match=r"--search and -params: .*policy_delay"):
+        tune._check("tdc", "NeedsKwargs-v0", {**settings, "policy_delay": 0})
