@@ -91,6 +91,8 @@ class Run:
         """Environment steps it has taken, as far as its files tell."""
         if self.folder.model.is_file():
             return self.folder.steps_of_model()
+        if self.folder.steps_at_end is not None:
+            return self.folder.steps_at_end
         progress = self.progress("time/total_timesteps")
         logged = progress[-1] if len(progress) else 0
         return int(max(logged, self.evaluations.timesteps[-1] if self.evaluations else 0))
@@ -123,7 +125,9 @@ class Run:
 
     @cached_property
     def system(self) -> str:
-        """The versions and the system it was trained with, as SB3 keeps them in the model; "" before it is saved."""
+        """The versions and the commit it was trained with; of a run without these, what SB3 keeps in the model."""
+        if versions := self.folder.versions:
+            return " · ".join(f"{name} {value}" for name, value in versions.items())
         if not self.folder.model.is_file():
             return ""
         with zipfile.ZipFile(self.folder.model) as archive:

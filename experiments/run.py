@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments.jobs import Job, cluster, count_cores, run
+from experiments.publish import RESULTS
 from experiments.results import default_settings, find_runs, same_settings
 from experiments.suites import ISAAC, PACKAGES, PAPER, SUITES, Cell
 from sb3_tdc import train
@@ -246,6 +247,7 @@ def make_parser() -> Parser:
     add("--scale", type=float, default=1.0, help="fraction of the suite's steps")
     add("--only", nargs="+", action=Names, default=[], metavar="NAME", help="algorithms and environments")
     add("--logs", type=Path, default=Path("logs"), help="folder of all runs")
+    add("--results", type=Path, default=RESULTS, help="folder of published results: runs that are there are skipped")
     add("--jobs", type=int, help="runs at once (default: one a core)")
     add("--address", help="of a Ray cluster that shares this file system (default: this machine)")
     add("--dry-run", action="store_true", help="say what would be run, and how long it would take")
@@ -263,6 +265,18 @@ def _plan(args: argparse.Namespace) -> Plan:
     seeds = range(1, args.seeds[0] + 1) if len(args.seeds) == 1 else list(dict.fromkeys(args.seeds))
     cells = [cell for suite in (PAPER if args.suite == "all" else [args.suite]) for cell in SUITES[suite]]
     return make_plan(select(cells, args.only), seeds, args.scale, args.logs)
+
+
+def _without_published(plan: Plan, args: argparse.Namespace) -> Plan:
+    """:return: the jobs that have no published results"""
+
+    def is_published(job: Job) -> bool:
+        return replace(job, logs=args.results / job.logs.relative_to(args.logs.resolve())).is_finished
+
+    jobs = [job for job in plan.jobs if not is_published(job)]
+    if len(jobs) < len(plan.jobs):
+        print(f"{len(plan.jobs) - len(jobs)} of {len(plan.jobs)} runs are in {args.results}")
+    return replace(plan, jobs=jobs)
 
 
 def _describe(args: argparse.Namespace, plan: Plan) -> None:
@@ -284,6 +298,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         plan = _plan(args)
+        plan = _without_published(plan, args)
         to_run = [job for job in plan.jobs if not job.is_finished]
         _describe(args, plan)
         if args.dry_run:

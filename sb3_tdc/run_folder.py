@@ -124,6 +124,17 @@ class RunFolder:
         return int(given if isinstance(given, int) and given > 0 else self.config["n_timesteps"])
 
     @property
+    def versions(self) -> dict[str, str]:
+        """The versions, the commit and the processor that the run began with; empty for a run of RL Zoo."""
+        path = self.path / self.env_name / "versions.yml"
+        return _read_yaml(path) if path.is_file() else {}
+
+    @property
+    def steps_at_end(self) -> int | None:
+        """The environment steps that a finished run has taken; None if it is not finished, or does not say so."""
+        return int(_read_yaml(self._finished)["n_timesteps"]) if self._finished.is_file() else None
+
+    @property
     def is_finished(self) -> bool:
         """
         Whether training came to its end, which a callback may have set; after an interruption it has not.

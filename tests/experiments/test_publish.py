@@ -1,0 +1,87 @@
+"""What of a run is published, that a report made from it says the same, and that the matrix does not run it again."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from experiments import publish, run, test_returns
+from experiments.results import find_runs
+from experiments.suites import SUITES, Cell
+from sb3_tdc import plain_yaml, train
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """A real run in its place in a matrix, with test episodes."""
+    folder = tmp_path_factory.mktemp("logs")
+    (job,) = run.make_plan([Cell("tdc", "Pendulum-v1", SMALL, 600)], [3], 1.0, folder).jobs
+    assert train.main([*job.arguments, "--verbose", "0", "--log-interval", "1"]) == 0
+    assert test_returns.main([str(folder), "--episodes", "4"]) == 0
+    return folder
+
+
+SMALL = {
+    "learning_starts": 50,
+    "batch_size": 8,
+    "buffer_size": 1000,
+    "policy_kwargs": {"net_arch": [8], "n_quantiles": 4},
+}
+
+
+def test_the_published_run_says_what_the_run_says(logs, tmp_path, monkeypatch):
+    monkeypatch.setattr(publish, "_ROWS", 2)
+    assert publish.main([str(logs), "-o", str(tmp_path)]) == 0
+    ((before,), _), ((after,), unreadable) = find_runs(logs), find_runs(tmp_path)
+    assert unreadable == []
+    assert after.settings == before.settings
+    assert (after.seed, after.steps, after.n_timesteps, after.is_finished) == (3, 600, 600, True)
+    assert after.system == before.system
+    assert "mujoco" in after.system
+    assert np.array_equal(after.evaluations.returns, before.evaluations.returns)
+    assert np.array_equal(test_returns.read_test_returns(after), test_returns.read_test_returns(before))
+    rows = before.progress("time/total_timesteps", "eval/mean_reward")
+    assert len(rows) > 10
+    assert after.progress("time/total_timesteps", "eval/mean_reward") == pytest.approx(rows, rel=1e-5)
+    variances = after.progress("time/total_timesteps", "train/td_error_var")
+    assert {tuple(row) for row in variances} <= {
+        (step, float(f"{value:.6g}")) for step, value in before.progress("time/total_timesteps", "train/td_error_var")
+    }
+
+
+def test_no_path_of_the_machine_and_no_model_is_published(logs, tmp_path):
+    publish.main([str(logs), "-o", str(tmp_path)])
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not any(path.suffix in (".zip", ".pkl") for path in files)
+    assert not any(str(logs).encode() in path.read_bytes() for path in files)
+    assert sum(path.stat().st_size for path in files) < 40_000
+    (args,) = tmp_path.rglob("args.yml")
+    assert plain_yaml.load(args.read_text(), "")["log_folder"] == str(args.parents[3].relative_to(tmp_path))
+
+
+def test_the_matrix_skips_what_is_published(logs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(SUITES, "fig1", [Cell("tdc", "Pendulum-v1", SMALL, 600)])
+    publish.main([str(logs), "-o", str(tmp_path / "results")])
+    command = ["fig1", "--seeds", "3", "4", "--logs", str(tmp_path / "logs"), "--results", str(tmp_path / "results")]
+    monkeypatch.setattr(run, "measure_rate", lambda job: 100.0)
+    assert run.main([*command, "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    assert f"1 of 2 runs are in {tmp_path / 'results'}" in out
+    assert "1 of 1 to run" in out
+    assert "seed 4" in out
+
+
+def test_unfinished_runs_are_not_published(logs, tmp_path):
+    copy = tmp_path / "logs"
+    shutil.copytree(logs, copy)
+    next(copy.rglob("finished.yml")).unlink()
+    assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 0
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
+    copy = tmp_path / "logs"
+    shutil.copytree(logs, copy)
+    next(copy.rglob(test_returns.FILE)).unlink()
+    assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 1
+    assert "Without test episodes" in capsys.readouterr().out
