@@ -28,6 +28,7 @@ from sb3_tdc.explain import play_episodes, steps_until_negligible, write_explana
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.rendering import VIDEO_SUFFIXES, VideoWriter, choose_gl_backend, display_works, follow_agent, render_modes
 from sb3_tdc.run_folder import RunFolder
+from sb3_tdc.safe_load.run_files import check_arguments, check_imports
 from sb3_tdc.tdc import TDC
 
 # What users of RL Zoo type by habit
@@ -105,26 +106,6 @@ def find_model(args: argparse.Namespace, run: RunFolder) -> Path:
 
 # What of a run's hyperparameters the environments are made of
 _OF_THE_ENVIRONMENT = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper", "env_kwargs")
-_WRAPPER_PACKAGES = (
-    "gymnasium.wrappers", "stable_baselines3.common", "sb3_contrib.common", "rl_zoo3.wrappers",
-)  # fmt: skip
-
-
-def _check_imports(run: RunFolder, gym_packages: Sequence[str]) -> None:
-    """:raises ValueError: if the files of a run name code to import that the user has not named"""
-    package, _, _ = run.args["env"].rpartition(":")
-    for name in [*run.args["gym_packages"], *([package] if package else [])]:
-        if name not in gym_packages:
-            raise ValueError(f"{run.path} asks for the package {name}: if you know it, add --gym-packages {name}")
-    allowed = (*_WRAPPER_PACKAGES, *gym_packages)
-    for key in ("env_wrapper", "vec_env_wrapper"):
-        wrappers = run.config.get(key) or []
-        for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
-            for name in wrapper if isinstance(wrapper, dict) else [wrapper]:
-                if not any(str(name).startswith(f"{prefix}.") for prefix in allowed):
-                    raise ValueError(
-                        f"{run.path} asks for {key} {name}: if you know it, add --gym-packages and its module"
-                    )
 
 
 @dataclass
@@ -156,8 +137,9 @@ def find_trained(args: argparse.Namespace) -> Trained:
         run = find_run(args)
         path = find_model(args, run)
     trained = run.args
+    check_arguments(trained, ALGORITHMS, str(run.path / run.env_name / "args.yml"))
     if not args.trust:
-        _check_imports(run, args.gym_packages)
+        check_imports(trained, run.config, args.gym_packages, str(run.path))
     args.gym_packages = [*trained["gym_packages"], *args.gym_packages]
     apply_common_arguments(args, trained["env"])
     config = {key: value for key, value in run.config.items() if key in _OF_THE_ENVIRONMENT}

@@ -33,7 +33,10 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the texts that the loader would take for numbers."""
+    """Quotes the texts that the loader would take for numbers; writes what is shared twice."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
     yaml_implicit_resolvers = _resolvers(yaml.SafeDumper)
 
@@ -52,15 +55,29 @@ _Loader.add_constructor(f"{_PYTHON}/object/apply:collections.OrderedDict", _cons
 _Loader.add_constructor(f"{_PYTHON}/tuple", _construct_sequence)
 
 
-def load(text: str, where: str) -> Any:
+class _UntrustedLoader(_Loader):
+    """Nothing that makes much of little: no aliases, no merges."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases are not read from a run folder")
+        return super().compose_node(parent, index)
+
+    def flatten_mapping(self, node: Any) -> None:
+        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+            raise yaml.YAMLError("merges are not read from a run folder")
+
+
+def load(text: str, where: str, is_trusted: bool = True) -> Any:
     """
     Read a YAML document of plain values.
 
     :param where: the file or the argument, for the error
+    :param is_trusted: whether it may have aliases and merges, by which a few lines can stand for billions of values
     :raises ValueError: if it is not one
     """
     try:
-        return yaml.load(text, _Loader)
+        return yaml.load(text, _Loader if is_trusted else _UntrustedLoader)
     except (yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{where} is not YAML of plain values: {' '.join(str(error).split())}") from error
 

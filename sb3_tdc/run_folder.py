@@ -16,8 +16,10 @@ from typing import Any
 
 from sb3_tdc import plain_yaml
 from sb3_tdc.hyperparams import suggest
+from sb3_tdc.safe_load.files import read_text
 from sb3_tdc.versions import commit_of_the_code, library_versions, processor_name
 
+_MAX_YAML = 2**18  # bytes; what train.py and RL Zoo write has some thousands
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
@@ -251,10 +253,7 @@ def save(save_as: Callable[[Path], Any], path: Path) -> None:
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     """:raises ValueError: if a file is not a mapping of plain values"""
-    try:
-        content = plain_yaml.load(path.read_text(), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+    content = plain_yaml.load(read_text(path, _MAX_YAML), str(path), is_trusted=False)
     if not isinstance(content, dict):
         raise ValueError(f"{path} must be a mapping")
     return content

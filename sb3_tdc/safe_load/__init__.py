@@ -6,7 +6,7 @@ field is read as data, recognised by name and rebuilt from known classes, or ref
 anything is decompressed or allocated. What that covers, and what not: docs/safety.md.
 """
 
-from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
+from sb3_tdc.safe_load.budget import UnsafeFileError
 from sb3_tdc.safe_load.models import load_safely, read_data
 from sb3_tdc.safe_load.objects import load_normalization, load_replay_buffer
 

@@ -5,9 +5,9 @@ import re
 import zipfile
 from typing import IO
 
-from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
 
-MAX_BYTES = 2**30  # of a file, and of what it decompresses to
+MAX_BYTES = 2**30  # of a file
 MAX_RATIO = 100  # of decompressed to compressed; SB3 itself does not compress
 MAX_DIRECTORY = 2**20  # bytes of a zip's list of entries
 
@@ -17,9 +17,10 @@ MODEL_ENTRIES = re.compile(
 )
 
 
-def read_archive(file: IO[bytes], allowed: re.Pattern) -> dict[str, bytes]:
+def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget) -> dict[str, bytes]:
     """
     :param allowed: what entries may be called
+    :param budget: of all that is read from the file
     :return: the bytes of each entry
     :raises UnsafeFileError: for other, repeated, encrypted, oversized or suspiciously compressed entries, unread
     """
@@ -30,13 +31,12 @@ def read_archive(file: IO[bytes], allowed: re.Pattern) -> dict[str, bytes]:
         names = [entry.filename for entry in entries]
         for entry in entries:
             if not allowed.fullmatch(entry.filename) or names.count(entry.filename) > 1:
-                raise UnsafeFileError(f"its entry {entry.filename[:100]!r} is unknown or repeated")
+                raise UnsafeFileError(f"its entry {shown(entry.filename)} is unknown or repeated")
             if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise UnsafeFileError(f"its entry {entry.filename!r} is encrypted, or compressed in an unknown way")
+                raise UnsafeFileError(f"its entry {shown(entry.filename)} is encrypted or compressed in an unknown way")
             if entry.file_size > MAX_RATIO * max(entry.compress_size, 100):
-                raise UnsafeFileError(f"its entry {entry.filename!r} is compressed more than {MAX_RATIO}-fold")
-        if sum(entry.file_size for entry in entries) > MAX_BYTES:
-            raise UnsafeFileError(f"it holds more than {MAX_BYTES:,} bytes")
+                raise UnsafeFileError(f"its entry {shown(entry.filename)} is compressed more than {MAX_RATIO}-fold")
+        budget.take_bytes(sum(entry.file_size for entry in entries))
         return {entry.filename: archive.read(entry) for entry in entries}
 
 

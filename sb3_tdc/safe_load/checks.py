@@ -3,10 +3,10 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import Enum
 from typing import Any
 
-from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
-from sb3_tdc.tdc.checks import check_integer
+from sb3_tdc.safe_load.budget import UnsafeFileError, escaped, shown
 
 MAX_ITEMS = 64  # of a list or mapping in the arguments of a network or an optimizer
 
@@ -17,18 +17,33 @@ def reading(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
-        raise UnsafeFileError(f"{what}: {reason}") from error
+        reason = next(iter((str(error)[:2000].strip() or type(error).__name__).splitlines()))
+        raise UnsafeFileError(f"{what}: {escaped(reason)}") from error
 
 
 def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
     """:return: a check of a field, as :func:`boolean` is one"""
 
     def check(name: str, value: Any) -> int:
-        number = check_integer(name, value, minimum)
-        if number > maximum:
-            raise ValueError(f"{name} must be at most {maximum:,}, got {number:,}")
-        return number
+        if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
+            raise ValueError(f"{name} must be an integer from {minimum:,} to {maximum:,}, got {shown(value)}")
+        return value
+
+    return check
+
+
+def number(
+    minimum: float = -math.inf, maximum: float = math.inf, above: float = -math.inf
+) -> Callable[[str, Any], float]:
+    """:return: a check of a field: a finite number in a range, which does not hold ``above``"""
+
+    def check(name: str, value: Any) -> float:
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not math.isfinite(value) or not minimum <= value <= maximum or not value > above:
+            low = f"above {above:g}" if above > -math.inf else f"from {minimum:g}"
+            allowed = "" if minimum == above == -math.inf and maximum == math.inf else f" {low} to {maximum:g}"
+            raise ValueError(f"{name} must be a finite number{allowed}, got {shown(value)}")
+        return value
 
     return check
 
@@ -41,13 +56,13 @@ def boolean(name: str, value: Any) -> bool:
     :raises ValueError: unless it is True or False
     """
     if not isinstance(value, bool):
-        raise ValueError(f"{name} must be true or false, got {value!r:.100}")
+        raise ValueError(f"{name} must be true or false, got {shown(value)}")
     return value
 
 
 def is_plain(value: Any, depth: int = 0) -> bool:
     """Whether a value is of finite numbers, texts, booleans, None and classes, in short lists and mappings."""
-    if isinstance(value, (bool, str, type, type(None))):
+    if isinstance(value, (bool, str, type, type(None), Enum)):
         return True
     if isinstance(value, (int, float)):
         return math.isfinite(value) and abs(value) < 2**63

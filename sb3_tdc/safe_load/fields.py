@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -14,15 +15,17 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
-from sb3_tdc.safe_load.checks import boolean, integer, is_plain, reading
-from sb3_tdc.safe_load.inert_pickle import UnsafeFileError, read_pickle, rebuild
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
+from sb3_tdc.safe_load.checks import boolean, integer, is_plain, number, reading
+from sb3_tdc.safe_load.inert_pickle import Name, Rebuild, names_in, read_pickle
 from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, name_of
 from sb3_tdc.tdc import TDC
-from sb3_tdc.tdc.checks import check_number
 
 MAX_REPLAY_BYTES = 2**36  # of the replay buffer that a loaded model gets
+MAX_HER_SLOTS = 2_000_000
 MAX_CRITICS = 256
 MAX_ENVS = 10_000
 # What is made of the argument ent_coef
@@ -48,28 +51,28 @@ def nearest_algorithm(policy_class: Any) -> type[OffPolicyAlgorithm] | None:
 def _instance(*kinds: type) -> Callable[[str, Any], Any]:
     def check(name: str, value: Any) -> Any:
         if isinstance(value, bool) or not isinstance(value, kinds):
-            raise ValueError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {value!r:.100}")
+            raise ValueError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {shown(value)}")
         return value
 
     return check
 
 
 def _schedule(name: str, value: Any) -> Any:
-    return value if callable(value) and not isinstance(value, type) else check_number(name, value, 0.0)
+    return value if callable(value) and not isinstance(value, type) else number(0.0)(name, value)
 
 
 def _text_or_number(name: str, value: Any) -> Any:
-    return value if isinstance(value, str) and len(value) < 100 else check_number(name, value)
+    return value if isinstance(value, str) and len(value) < 100 else number()(name, value)
 
 
 def _noise(name: str, value: Any) -> Any:
-    return value if isinstance(value, ActionNoise) else check_number(name, value, 0.0)
+    return value if isinstance(value, ActionNoise) else number(0.0)(name, value)
 
 
 def _subclass(base: type) -> Callable[[str, Any], Any]:
     def check(name: str, value: Any) -> Any:
         if not isinstance(value, type) or not issubclass(value, base):
-            raise ValueError(f"{name} must be a {base.__name__} class, got {value!r:.100}")
+            raise ValueError(f"{name} must be a {base.__name__} class, got {shown(value)}")
         return value
 
     return check
@@ -78,7 +81,7 @@ def _subclass(base: type) -> Callable[[str, Any], Any]:
 def _train_freq(name: str, value: Any) -> Any:
     if isinstance(value, TrainFreq):
         return value
-    if isinstance(value, list):
+    if isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
         return (integer(1)(name, value[0]), value[1])
     return integer(1)(name, value)
 
@@ -93,7 +96,7 @@ def _arguments(name: str, value: Any) -> dict[str, Any]:
 
 def _none(name: str, value: Any) -> None:
     if value is not None:
-        raise ValueError(f"{name} must be null, got {value!r:.100}")
+        raise ValueError(f"{name} must be null, got {shown(value)}")
 
 
 def _or_none(check: Callable[[str, Any], Any]) -> Callable[[str, Any], Any]:
@@ -129,10 +132,11 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
         ),
         integer(0),
     ),
-    **dict.fromkeys(
-        ("tau", "gamma", "kappa", "target_policy_noise", "target_noise_clip", "_current_progress_remaining"),
-        check_number,
-    ),
+    "gamma": number(0.0, 1.0),
+    "tau": number(maximum=1.0, above=0.0),
+    "kappa": number(above=0.0),
+    "_current_progress_remaining": number(-1.0, 1.0),
+    **dict.fromkeys(("target_policy_noise", "target_noise_clip"), number(0.0)),
     **dict.fromkeys(
         (
             *("use_sde", "use_sde_at_warmup", "optimize_memory_usage", "stochastic_actor", "_built_stochastic_actor"),
@@ -150,8 +154,9 @@ _MADE_ANEW = {
 }  # fmt: skip
 
 
-def read_fields(raw: bytes, custom_objects: dict[str, Any]) -> dict[str, Any]:
+def read_fields(raw: bytes, custom_objects: dict[str, Any], budget: Budget) -> dict[str, Any]:
     """
+    :param budget: of the file
     :return: the fields of ``data`` that are known, each checked; those of ``custom_objects`` as they are given
     :raises UnsafeFileError: for any other, by name
     """
@@ -164,20 +169,77 @@ def read_fields(raw: bytes, custom_objects: dict[str, Any]) -> dict[str, Any]:
         elif name in _FIELDS:
             with reading(f"the field {name} (custom_objects can replace it)"):
                 if isinstance(value, dict) and ":serialized:" in value:
-                    value = rebuild(read_pickle(base64.b64decode(value[":serialized:"], validate=True)), classes, CALLS)
+                    value = Rebuild(classes, CALLS, budget)(_pickled(value, budget))
                 fields[name] = _FIELDS[name](name, value)
         elif name not in _MADE_ANEW:
-            raise UnsafeFileError(f"the field {name[:100]!r} is unknown (custom_objects can replace it)")
+            raise UnsafeFileError(f"the field {shown(name)} is unknown (custom_objects can replace it)")
+    _warn_of_code(data, custom_objects, budget)
     known = constructor_hints(fields.get("policy_class", BasePolicy)).keys() - POLICY_ARGUMENTS
     fields.setdefault("policy_kwargs", {}).pop("device", None)
     for name in fields["policy_kwargs"]:
         if name not in known:
-            raise UnsafeFileError(f"the field policy_kwargs has the unknown key {name[:100]!r}")
+            raise UnsafeFileError(f"the field policy_kwargs has the unknown key {shown(name)}")
     return fields
 
 
+def _pickled(value: Any, budget: Budget) -> Any:
+    """:return: what :func:`read_pickle` makes of a pickled field"""
+    text = value[":serialized:"]
+    if not isinstance(text, str):
+        raise UnsafeFileError("its pickle is not a text")
+    budget.take_bytes(len(text))
+    return read_pickle(base64.b64decode(text, validate=True), budget)
+
+
+def foreign_names(value: Any, budget: Budget) -> list[str]:
+    """
+    :param value: a field of ``data``
+    :return: what SB3's ``load`` would import or call for it that is not known to be harmless, sorted
+    """
+    if not (isinstance(value, dict) and ":serialized:" in value):
+        return []
+    policies = {name_of(policy) for policy in known_policies()}
+    known = {*CLASSES, *CALLS, *policies, *_HARMLESS}
+    return sorted(str(name) for name in names_in(_pickled(value, budget)) if name not in known)
+
+
+# What SB3 and numpy write into fields that are made anew, and into attributes that are not looked at
+_HARMLESS = {
+    *(Name("collections", kind) for kind in ("deque", "defaultdict", "Counter")),
+    *(Name("builtins", kind) for kind in ("set", "frozenset", "complex", "bytearray")),
+    *(Name("numpy", kind) for kind in ("ndarray", "float32", "float64", "int64", "uint8")),
+    *(Name("numpy.random._pickle", f"__{kind}_ctor") for kind in ("generator", "bit_generator", "randomstate")),
+    *(Name("numpy.random._pcg64", "PCG64"), Name("numpy.random._mt19937", "MT19937")),
+    *(Name("numpy.random.bit_generator", kind) for kind in ("SeedSequence", "__pyx_unpickle_SeedSequence")),
+    *(Name("pathlib", kind) for kind in ("PosixPath", "WindowsPath")),
+    Name("torch", "device"),
+}
+
+
+def _warn_of_code(data: dict[str, Any], custom_objects: dict[str, Any], budget: Budget) -> None:
+    for name in [name for name in data if name in _MADE_ANEW or name in custom_objects]:
+        try:
+            found = foreign_names(data[name], budget)
+        except (UnsafeFileError, ValueError) as error:
+            found = [f"something that cannot be read ({error})"]
+        if found:
+            warnings.warn(
+                f"The field {shown(name)} is not read here, but SB3's load would run code for it: "
+                f"{', '.join(found[:3])}{' …' if len(found) > 3 else ''}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+
+# Brackets and commas of JSON: SB3 writes some thousands, most of them inside texts
+_MAX_JSON = 500_000
+
+
 def parse_data(raw: bytes) -> dict[str, Any]:
+    """:raises UnsafeFileError: unless it is a mapping of JSON, each key once, of a reasonable number of values"""
     with reading("data"):
+        if sum(map(raw.count, (b"[", b"{", b","))) > _MAX_JSON:
+            raise UnsafeFileError("it has too many values")
         data = json.loads(raw, object_pairs_hook=_unique)
         if not isinstance(data, dict):
             raise UnsafeFileError("it does not hold fields")
@@ -190,8 +252,44 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
+# What SB3 writes of every off-policy algorithm, and of each; without one, a default would be taken for it in silence
+REQUIRED = (
+    *("policy_class", "learning_rate", "gamma", "tau", "batch_size", "buffer_size", "learning_starts", "train_freq"),
+    *("gradient_steps", "num_timesteps", "_n_updates", "_episode_num", "seed", "action_noise", "use_sde"),
+    *("optimize_memory_usage", "replay_buffer_class", "replay_buffer_kwargs"),
+)
+_OF_TD3 = ("policy_delay", "target_policy_noise", "target_noise_clip")
+_OF_SAC = ("ent_coef", "target_entropy", "target_update_interval")
+REQUIRED_OF: dict[str, tuple[str, ...]] = {
+    "TD3": _OF_TD3,
+    "SAC": _OF_SAC,
+    "TQC": (*_OF_SAC, "top_quantiles_to_drop_per_net"),
+    "TDC": (*_OF_TD3, "lam", "kappa", "qf_learning_rate", "stochastic_actor", "ent_coef", "target_entropy"),
+}
+
+
+def check_complete(fields: dict[str, Any], algorithm: type[OffPolicyAlgorithm]) -> None:
+    """
+    :param algorithm: that the policy is of
+    :raises UnsafeFileError: if a field is missing that SB3 always writes
+    """
+    for name in (*REQUIRED, *REQUIRED_OF.get(algorithm.__name__, ())):
+        if name not in fields:
+            raise UnsafeFileError(f"the field {name} is missing (custom_objects can give it)")
+
+
+def is_her(fields: dict[str, Any]) -> bool:
+    """Whether the model gets a replay buffer with hindsight."""
+    kind = fields.get("replay_buffer_class")
+    return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
+
+
 def check_replay_memory(fields: dict[str, Any]) -> None:
     size, observations = fields.get("buffer_size", 1), fields["observation_space"]
+    if is_her(fields) and size > MAX_HER_SLOTS:  # it makes a dict for every one of them
+        raise UnsafeFileError(
+            f"its HerReplayBuffer of {size:,} transitions takes more memory than it should: give a smaller buffer_size"
+        )
     parts: Any = observations.spaces.values() if isinstance(observations, spaces.Dict) else [observations]
     n_bytes = size * sum(2 * math.prod(part.shape) * part.dtype.itemsize for part in parts)
     if n_bytes > MAX_REPLAY_BYTES:

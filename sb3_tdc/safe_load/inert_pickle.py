@@ -2,23 +2,19 @@
 Read a pickle without running it.
 
 What a pickle would import comes back as a :class:`Name`, and what it would call as a :class:`Call`: records, which
-:func:`rebuild` turns into objects only where the caller knows them. No module is imported, no class is looked up, and
+:class:`Rebuild` turns into objects only where the caller knows them. No module is imported, no class is looked up, and
 Python's unpickler is not used.
 """
 
 import pickletools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import IO, Any, NamedTuple, TypeAlias
+from typing import IO, Any, NamedTuple
 
-# Far above what SB3 writes for a model; below what could stall the reader
-MAX_OPCODES = 10_000_000
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, escaped
+
 MAX_DEPTH = 64
 MAX_INTEGER_BITS = 128  # numpy's generators have states of that size
-
-
-class UnsafeFileError(ValueError):
-    """A file that is not opened, with the reason in one sentence: it asks for more than data, or it is damaged."""
 
 
 class Name(NamedTuple):
@@ -28,7 +24,7 @@ class Name(NamedTuple):
     attribute: str
 
     def __str__(self) -> str:
-        return f"{self.module}.{self.attribute}"[:200]
+        return escaped(f"{self.module[:100]}.{self.attribute[:100]}")
 
 
 @dataclass(eq=False)
@@ -47,7 +43,6 @@ class Call:
 
 
 PERSISTENT = Name("pickle", "persistent_load")
-Rebuild: TypeAlias = Callable[[Any], Any]
 
 _PUSHED = {
     "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT", "UNICODE", "BINUNICODE",
@@ -59,24 +54,26 @@ _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 _FROM_MARK: dict[str, Callable[[list[Any]], Any]] = {"TUPLE": tuple, "LIST": list}
 _CALLS = {"REDUCE", "NEWOBJ"}
 _PUT, _GET = {"PUT", "BINPUT", "LONG_BINPUT"}, {"GET", "BINGET", "LONG_BINGET"}
-_SCALARS = (str, bytes, int, float, bool, type(None))  # what a key may be: cheap to hash, whatever the file says
+_SCALARS = (str, bytes, int, float, bool, type(None))
+MAX_KEY = 2**32  # integers below it cannot be chosen so that their hashes collide
 
 
-def read_pickle(data: bytes | IO[bytes]) -> Any:
+def read_pickle(data: bytes | IO[bytes], budget: Budget) -> Any:
     """
     :param data: a pickle of protocol 2 or later, or a file whose ``read(n)`` makes nothing larger than what is left
+    :param budget: of the file that it is in
     :return: numbers, texts, bytes, tuples, lists, dicts and sets of these; :class:`Name`; :class:`Call`
     :raises UnsafeFileError: if it is damaged, or is more than data, names and calls
     """
     try:
-        return _run(data)
+        return _run(data, budget)
     except UnsafeFileError:
         raise
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UnsafeFileError("a damaged pickle") from error
 
 
-def _run(data: bytes | IO[bytes]) -> Any:
+def _run(data: bytes | IO[bytes], budget: Budget) -> Any:
     """The pickle machine, in which importing and calling are only noted down."""
     stack: list[Any] = []
     marks: list[list[Any]] = []  # the stacks below each MARK
@@ -88,10 +85,9 @@ def _run(data: bytes | IO[bytes]) -> Any:
         return items
 
     argument: Any
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+    for opcode, argument, _ in pickletools.genops(data):
         name = opcode.name
-        if count > MAX_OPCODES:
-            raise UnsafeFileError(f"a pickle of more than {MAX_OPCODES:,} operations")
+        budget.take_opcode()
         if name in _PUSHED:
             if isinstance(argument, int) and argument.bit_length() > MAX_INTEGER_BITS:
                 raise UnsafeFileError(f"an integer of {argument.bit_length():,} bits")
@@ -129,8 +125,8 @@ def _run(data: bytes | IO[bytes]) -> Any:
             _set_items(stack[-1], items)
         elif name in ("ADDITEMS", "FROZENSET"):
             items = pop_mark()
-            if not all(isinstance(item, _SCALARS) for item in items):
-                raise UnsafeFileError("a set of more than numbers and texts")
+            if not all(map(_is_key, items)):
+                raise UnsafeFileError("a set of more than small integers and texts")
             stack[-1].update(items) if name == "ADDITEMS" else stack.append(set(items))
         elif name == "GLOBAL":
             stack.append(Name(*argument.split(" ", 1)))
@@ -160,10 +156,14 @@ def _last(stack: list[Any], n: int) -> list[Any]:
     return stack[-n:]
 
 
+def _is_key(value: Any) -> bool:
+    return isinstance(value, str | bool | None) or (isinstance(value, int) and abs(value) < MAX_KEY)
+
+
 def _set_items(target: Any, items: list[Any]) -> None:
     pairs = list(zip(items[::2], items[1::2], strict=True))
-    if not all(isinstance(key, _SCALARS) for key, _ in pairs):
-        raise UnsafeFileError("a mapping with keys that are more than numbers and texts")
+    if not all(_is_key(key) for key, _ in pairs):
+        raise UnsafeFileError("a mapping with keys that are more than small integers and texts")
     if isinstance(target, Call):
         target.items.extend(pairs)
     elif isinstance(target, dict):
@@ -172,57 +172,106 @@ def _set_items(target: Any, items: list[Any]) -> None:
         raise TypeError
 
 
-def rebuild(
-    value: Any,
-    classes: Mapping[Name, type],
-    calls: Mapping[Name, Callable[[Call, Rebuild], Any]],
-) -> Any:
+class Rebuild:
     """
-    Make objects of what :func:`read_pickle` returned.
+    Makes objects of what :func:`read_pickle` returned.
 
     :param classes: what a name may stand for
-    :param calls: what a call of a name makes; the function is given the record, and this function for its parts
-    :raises UnsafeFileError: for any other name or call, by name
+    :param calls: what a call of a name makes
+    :param budget: of the file. What is shared counts as often as it is reached, so that no text or array made of the
+        result can be much larger than the file
     """
-    finished: dict[int, tuple[Any, Any]] = {}  # by identity (the part is kept alive): what is shared is rebuilt once
-    under_way: set[int] = set()
 
-    def make(part: Any) -> Any:
+    def __init__(self, classes: "Mapping[Name, type]", calls: "Mapping[Name, Handler]", budget: Budget):
+        self.classes, self.calls, self.budget = classes, calls, budget
+        self._finished: dict[int, tuple[Any, Any, int]] = {}  # by identity (the part is kept alive): rebuilt once
+        self._under_way: set[int] = set()
+        self._nodes = 0
+
+    def __call__(self, part: Any) -> Any:
+        """
+        :param part: of the value
+        :raises UnsafeFileError: for a name or a call that is not known, by name
+        """
         if isinstance(part, (*_SCALARS, bytearray)):
+            self._count(1)
             return part
-        if id(part) in finished:
-            return finished[id(part)][1]
-        if id(part) in under_way or len(under_way) >= MAX_DEPTH:
+        if id(part) in self._finished:
+            _, result, size = self._finished[id(part)]
+            self._count(size)
+            return result
+        if id(part) in self._under_way or len(self._under_way) >= MAX_DEPTH:
             raise UnsafeFileError("data that contains itself, or is nested too deeply")
-        under_way.add(id(part))
+        self._under_way.add(id(part))
+        before = self._nodes
+        self._count(1)
         try:
-            result = _make(part, make, classes, calls)
+            result = self._make(part)
         finally:
-            under_way.discard(id(part))
-        finished[id(part)] = (part, result)
+            self._under_way.discard(id(part))
+        self._finished[id(part)] = (part, result, self._nodes - before)
         return result
 
-    return make(value)
+    def _count(self, n: int) -> None:
+        self._nodes += n
+        self.budget.take_nodes(n)
+
+    def _make(self, part: Any) -> Any:
+        if isinstance(part, Name):
+            if part not in self.classes:
+                raise UnsafeFileError(f"a reference to {part}")
+            return self.classes[part]
+        if isinstance(part, Call):
+            if not isinstance(part.function, Name):
+                raise UnsafeFileError("a call of something that has no name")
+            if part.function not in self.calls:
+                raise UnsafeFileError(f"a call of {part.function}")
+            return self.calls[part.function](part, self)
+        if isinstance(part, dict):
+            return {key: self(item) for key, item in part.items()}
+        if isinstance(part, (list, tuple, set)):
+            return type(part)(self(item) for item in part)
+        raise UnsafeFileError(f"a {type(part).__name__}")
 
 
-def _make(
-    part: Any,
-    make: Rebuild,
-    classes: Mapping[Name, type],
-    calls: Mapping[Name, Callable[[Call, Rebuild], Any]],
-) -> Any:
-    if isinstance(part, Name):
-        if part not in classes:
-            raise UnsafeFileError(f"a reference to {part}")
-        return classes[part]
-    if isinstance(part, Call):
-        if not isinstance(part.function, Name):
-            raise UnsafeFileError("a call of something that has no name")
-        if part.function not in calls:
-            raise UnsafeFileError(f"a call of {part.function}")
-        return calls[part.function](part, make)
-    if isinstance(part, dict):
-        return {key: make(item) for key, item in part.items()}
-    if isinstance(part, (list, tuple, set)):
-        return type(part)(make(item) for item in part)
-    raise UnsafeFileError(f"a {type(part).__name__}")
+@dataclass(frozen=True)
+class Handler:
+    """
+    What a call of a known name makes, and what of the call it takes. Anything else there refuses the file.
+
+    :param make: given the record, and what makes objects of its parts
+    :param args: how many arguments, the fewest and the most
+    :param state: whether it takes one
+    :param items: whether it takes any
+    """
+
+    make: Callable[[Call, Rebuild], Any]
+    args: tuple[int, int] = (0, 0)
+    state: bool = False
+    items: bool = False
+
+    def __call__(self, call: Call, make: Rebuild) -> Any:
+        fewest, most = self.args
+        if not isinstance(call.args, tuple) or not fewest <= len(call.args) <= most:
+            raise UnsafeFileError(f"a call of {call.function} with other arguments than it takes")
+        if (call.state is not None) > self.state or bool(call.items) > self.items:
+            raise UnsafeFileError(f"a {call.function} that is changed after it was made")
+        return self.make(call, make)
+
+
+def names_in(value: Any) -> set[Name]:
+    """Return everything that a pickle would import, however it is nested."""
+    found: set[Name] = set()
+    seen: dict[int, Any] = {}
+    waiting = [value]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, Name):
+            found.add(part)
+        elif isinstance(part, (Call, dict, list, tuple)) and id(part) not in seen:
+            seen[id(part)] = part
+            if isinstance(part, Call):
+                waiting += [part.function, part.args, part.state, part.items]
+            else:
+                waiting += part.values() if isinstance(part, dict) else part
+    return found

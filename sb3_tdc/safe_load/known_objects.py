@@ -19,7 +19,8 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 
-from sb3_tdc.safe_load.inert_pickle import Call, Name, Rebuild, UnsafeFileError
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
+from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
 from sb3_tdc.tdc.checks import check_integer, check_number
 
 MAX_DIMENSIONS = 8
@@ -60,8 +61,6 @@ def _attributes(call: Call, make: Rebuild, *names: str) -> list[Any]:
 
 
 def _arguments(call: Call, make: Rebuild, n: int) -> list[Any]:
-    if not isinstance(call.args, tuple) or len(call.args) < n:
-        raise UnsafeFileError(f"a call of {call.function} without its arguments")
     return [make(argument) for argument in call.args[:n]]
 
 
@@ -76,14 +75,16 @@ def _dtype(call: Call, make: Rebuild) -> np.dtype:
     return np.dtype(name)
 
 
-def _array(raw: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
+def _array(raw: Any, dtype: Any, shape: Any, order: str, budget: Budget) -> np.ndarray:
     """:return: (shape), writable; there must be as many bytes as it takes"""
     sizes = shape if isinstance(shape, tuple) else ()
     whole = isinstance(shape, tuple) and all(type(size) is int and size >= 0 for size in sizes)
     if not isinstance(raw, (bytes, bytearray)) or not isinstance(dtype, np.dtype) or not whole:
         raise UnsafeFileError("a damaged array")
-    if len(sizes) > MAX_DIMENSIONS or math.prod(sizes) * dtype.itemsize != len(raw):
-        raise UnsafeFileError(f"an array of {len(raw):,} bytes that says it is {sizes}"[:200])
+    fits = len(sizes) <= MAX_DIMENSIONS and all(size < 2**40 for size in sizes)
+    if not fits or math.prod(sizes) * dtype.itemsize != len(raw):
+        raise UnsafeFileError(f"an array of {len(raw):,} bytes that says it is another size")
+    budget.take_bytes(len(raw))
     array = np.frombuffer(raw, dtype).reshape(sizes, order="F" if order == "F" else "C")
     return array if isinstance(raw, bytearray) else array.copy()  # a replay buffer's gigabytes are not copied
 
@@ -92,16 +93,17 @@ def _array_of_state(call: Call, make: Rebuild) -> np.ndarray:
     if not isinstance(call.state, tuple) or len(call.state) != 5:
         raise UnsafeFileError("a damaged array")
     _, shape, dtype, fortran_order, raw = (make(part) for part in call.state)
-    return _array(raw, dtype, shape, "F" if fortran_order else "C")
+    return _array(raw, dtype, shape, "F" if fortran_order else "C", make.budget)
 
 
 def _array_of_buffer(call: Call, make: Rebuild) -> np.ndarray:
-    return _array(*_arguments(call, make, 4))
+    raw, dtype, shape, order = _arguments(call, make, 4)
+    return _array(raw, dtype, shape, order, make.budget)
 
 
 def _scalar(call: Call, make: Rebuild) -> Any:
     dtype, raw = _arguments(call, make, 2)
-    return _array(raw, dtype, (), "C").item()
+    return _array(raw, dtype, (), "C", make.budget).item()
 
 
 # -------------------------------------------------------------------- spaces
@@ -111,6 +113,7 @@ def _box(call: Call, make: Rebuild) -> spaces.Box:
     low, high = _attributes(call, make, "low", "high")
     if not (isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and low.shape == high.shape):
         raise UnsafeFileError("a Box without bounds of one shape")
+    make.budget.take_bytes(4 * low.nbytes)  # it keeps copies of both, and where they are finite
     return spaces.Box(low, high, dtype=low.dtype.type)
 
 
@@ -133,7 +136,9 @@ def _multi_discrete(call: Call, make: Rebuild) -> spaces.MultiDiscrete:
 
 def _multi_binary(call: Call, make: Rebuild) -> spaces.MultiBinary:
     (n,) = _attributes(call, make, "n")
-    return spaces.MultiBinary(check_integer("n of a MultiBinary space", n, 1))
+    size = check_integer("n of a MultiBinary space", n, 1)
+    make.budget.take_bytes(size)
+    return spaces.MultiBinary(size)
 
 
 # -------------------------------------------------------------------- what a run was set up with
@@ -227,28 +232,45 @@ def _enum_of_name(call: Call, make: Rebuild) -> Enum:
     return _ENUMS[cls][member]
 
 
-CALLS: dict[Name, Callable[[Call, Rebuild], Any]] = {
-    Name("collections", "OrderedDict"): _ordered_dict,
-    Name("numpy", "dtype"): _dtype,
+def _object(make: Callable[[Call, Rebuild], Any]) -> Handler:
+    """:return: of an object that is made without arguments, and given its attributes"""
+    return Handler(make, state=True)
+
+
+CALLS: dict[Name, Handler] = {
+    Name("collections", "OrderedDict"): Handler(_ordered_dict, items=True),
+    Name("numpy", "dtype"): Handler(_dtype, args=(1, 3), state=True),
     # numpy 2 moved what numpy 1 had in numpy.core
-    **{Name(f"numpy.{core}.multiarray", "_reconstruct"): _array_of_state for core in ("core", "_core")},
-    **{Name(f"numpy.{core}.multiarray", "scalar"): _scalar for core in ("core", "_core")},
-    **{Name(f"numpy.{core}.numeric", "_frombuffer"): _array_of_buffer for core in ("core", "_core")},
+    **{
+        Name(f"numpy.{core}.{module}", function): handler
+        for core in ("core", "_core")
+        for module, function, handler in (
+            ("multiarray", "_reconstruct", Handler(_array_of_state, args=(3, 3), state=True)),
+            ("multiarray", "scalar", Handler(_scalar, args=(2, 2))),
+            ("numeric", "_frombuffer", Handler(_array_of_buffer, args=(4, 4))),
+        )
+    },
     # gymnasium was gym
-    **{Name(f"{gym}.spaces.box", "Box"): _box for gym in ("gym", "gymnasium")},
-    **{Name(f"{gym}.spaces.dict", "Dict"): _dict_space for gym in ("gym", "gymnasium")},
-    **{Name(f"{gym}.spaces.discrete", "Discrete"): _discrete for gym in ("gym", "gymnasium")},
-    **{Name(f"{gym}.spaces.multi_discrete", "MultiDiscrete"): _multi_discrete for gym in ("gym", "gymnasium")},
-    **{Name(f"{gym}.spaces.multi_binary", "MultiBinary"): _multi_binary for gym in ("gym", "gymnasium")},
-    Name(f"{_SB3}.noise", "NormalActionNoise"): _normal_noise,
-    Name(f"{_SB3}.noise", "OrnsteinUhlenbeckActionNoise"): _ornstein_uhlenbeck_noise,
-    Name(f"{_SB3}.noise", "VectorizedActionNoise"): _base_noise,
-    Name(f"{_SB3}.utils", "LinearSchedule"): _linear_schedule,
-    Name(f"{_SB3}.utils", "ConstantSchedule"): _constant_schedule,
-    Name(f"{_SB3}.utils", "FloatSchedule"): _float_schedule,
-    Name("rl_zoo3.utils", "SimpleLinearSchedule"): _zoo_schedule,
-    Name(f"{_SB3}.type_aliases", "TrainFreq"): _train_freq,
-    **dict.fromkeys(_ENUMS, _enum_of_value),
-    Name("builtins", "getattr"): _enum_of_name,
-    Name(f"{_SB3}.running_mean_std", "RunningMeanStd"): _running_mean_std,
+    **{
+        Name(f"{gym}.spaces.{module}", space): _object(make)
+        for gym in ("gym", "gymnasium")
+        for module, space, make in (
+            ("box", "Box", _box),
+            ("dict", "Dict", _dict_space),
+            ("discrete", "Discrete", _discrete),
+            ("multi_discrete", "MultiDiscrete", _multi_discrete),
+            ("multi_binary", "MultiBinary", _multi_binary),
+        )
+    },
+    Name(f"{_SB3}.noise", "NormalActionNoise"): _object(_normal_noise),
+    Name(f"{_SB3}.noise", "OrnsteinUhlenbeckActionNoise"): _object(_ornstein_uhlenbeck_noise),
+    Name(f"{_SB3}.noise", "VectorizedActionNoise"): _object(_base_noise),
+    Name(f"{_SB3}.utils", "LinearSchedule"): _object(_linear_schedule),
+    Name(f"{_SB3}.utils", "ConstantSchedule"): _object(_constant_schedule),
+    Name(f"{_SB3}.utils", "FloatSchedule"): _object(_float_schedule),
+    Name("rl_zoo3.utils", "SimpleLinearSchedule"): _object(_zoo_schedule),
+    Name(f"{_SB3}.running_mean_std", "RunningMeanStd"): _object(_running_mean_std),
+    Name(f"{_SB3}.type_aliases", "TrainFreq"): Handler(_train_freq, args=(2, 2)),
+    **dict.fromkeys(_ENUMS, Handler(_enum_of_value, args=(1, 1))),
+    Name("builtins", "getattr"): Handler(_enum_of_name, args=(2, 2)),
 }

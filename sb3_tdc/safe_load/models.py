@@ -10,17 +10,19 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
+from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
 from sb3_tdc.safe_load.checks import reading
 from sb3_tdc.safe_load.fields import (
     TEMPERATURE,
+    check_complete,
     check_replay_memory,
     known_policies,
     nearest_algorithm,
     parse_data,
     read_fields,
 )
-from sb3_tdc.safe_load.inert_pickle import UnsafeFileError
+from sb3_tdc.safe_load.files import open_regular
 from sb3_tdc.safe_load.weights import check_optimizer, check_weights, read_tensors
 
 
@@ -52,14 +54,16 @@ def load_safely(
     if not path.exists() and path.with_name(f"{path.name}.zip").is_file():
         path = path.with_name(f"{path.name}.zip")
     with reading(f"{path} was not opened"):
-        with path.open("rb") as file:
-            entries = read_archive(file, MODEL_ENTRIES)
+        with open_regular(path, MAX_BYTES) as (file, size):
+            budget = Budget(size)
+            entries = read_archive(file, MODEL_ENTRIES, budget)
         for required in ("data", "policy.pth"):
             if required not in entries:
                 raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
         given = {**kwargs, **(custom_objects or {})}
-        fields = read_fields(entries["data"], {name: value for name, value in given.items() if name != "ent_coef"})
-        policy_class = fields.pop("policy_class", None)
+        of_the_caller = {name: value for name, value in given.items() if name != "ent_coef"}
+        fields = read_fields(entries["data"], of_the_caller, budget)
+        policy_class: Any = fields.get("policy_class")
         saved_by = known_policies().get(policy_class) or nearest_algorithm(policy_class)
         new_temperature = "ent_coef" in given and given["ent_coef"] != fields.get("ent_coef")
         fields.update({name: given[name] for name in (*kwargs, "ent_coef") if name in given})
@@ -67,11 +71,13 @@ def load_safely(
             raise UnsafeFileError("it has no policy_class of TDC, TD3, SAC, DDPG or TQC")
         if algorithm is not None and not issubclass(algorithm, saved_by):
             raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
+        check_complete(fields, saved_by)
+        del fields["policy_class"]
         algorithm = algorithm or saved_by
         tensors = {}
         for name in (name for name in entries if name.endswith(".pth")):
             with reading(name):
-                tensors[name.removesuffix(".pth")] = read_tensors(entries[name], device)
+                tensors[name.removesuffix(".pth")] = read_tensors(entries[name], budget)
 
     if env is not None:
         env = algorithm._wrap_env(env, fields.get("verbose", 0))
@@ -94,8 +100,8 @@ def read_data(path: str | Path) -> dict[str, Any]:
     :raises UnsafeFileError: if it is not the zip of a saved model
     """
     with reading(f"{path} is not the zip of a saved model"):
-        with Path(path).open("rb") as file:
-            return parse_data(read_archive(file, MODEL_ENTRIES)["data"])
+        with open_regular(path, MAX_BYTES) as (file, size):
+            return parse_data(read_archive(file, MODEL_ENTRIES, Budget(size))["data"])
 
 
 def _make_model(
@@ -111,7 +117,7 @@ def _make_model(
     vars(model).update(fields)
     model._setup_model()
     state_dicts, variables = model._get_torch_save_params()
-    saved_variables = {**tensors.pop("tensors", {}), **tensors.pop("pytorch_variables", {})}
+    saved_variables = _variables(tensors)
     if new_temperature:
         saved_variables = {name: value for name, value in saved_variables.items() if name not in TEMPERATURE}
         tensors = {name: value for name, value in tensors.items() if name not in TEMPERATURE}
@@ -124,15 +130,30 @@ def _make_model(
                     optimizer = getattr(optimizer, attribute)
                 check_optimizer(optimizer, tensors[name])
     model.set_parameters(tensors, exact_match=True, device=device)
+    if not new_temperature and (missing := [name for name in variables if saved_variables.get(name) is None]):
+        raise UnsafeFileError(f"pytorch_variables.pth: {missing[0]} is missing")
     for name, value in saved_variables.items():
-        with reading(f"pytorch_variables.pth, {str(name)[:100]}"):
+        with reading(f"pytorch_variables.pth, {shown(name)}"):
             if name not in variables:
+                if value is None:  # SB3 writes it where there is none
+                    continue
                 raise UnsafeFileError("it is unknown")
-            if value is not None:
-                current = getattr(model, name)
-                if value.shape != current.shape or not value.isfinite().all():
-                    raise UnsafeFileError("it is of another shape, or not finite")
-                current.data = value.data.to(current.device, current.dtype)
+            current = getattr(model, name)
+            if value.shape != current.shape or value.dtype != current.dtype or not value.isfinite().all():
+                raise UnsafeFileError("it is of another shape or type, or not finite")
+            current.data = value.data.to(current.device)
     if model.use_sde:
         model.policy.reset_noise()
     return model
+
+
+def _variables(tensors: dict[str, Any]) -> dict[str, Any]:
+    """Take the single tensors from the parts of a zip; ``tensors.pth`` is their name in the first versions of SB3."""
+    found: dict[str, Any] = {}
+    for part in ("tensors", "pytorch_variables"):
+        values = tensors.pop(part, None) or {}
+        with reading(f"{part}.pth"):
+            if not isinstance(values, dict) or not all(isinstance(v, th.Tensor | None) for v in values.values()):
+                raise UnsafeFileError("it does not hold tensors by name")
+        found |= values
+    return found

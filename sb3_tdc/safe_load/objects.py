@@ -12,11 +12,12 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_tdc.safe_load.checks import boolean, integer, reading
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
+from sb3_tdc.safe_load.checks import boolean, integer, number, reading
 from sb3_tdc.safe_load.fields import MAX_ENVS, MAX_REPLAY_BYTES
-from sb3_tdc.safe_load.inert_pickle import Call, Rebuild, UnsafeFileError, read_pickle, rebuild
+from sb3_tdc.safe_load.files import open_regular
+from sb3_tdc.safe_load.inert_pickle import Call, Handler, Rebuild, read_pickle
 from sb3_tdc.safe_load.known_objects import CALLS, name_of
-from sb3_tdc.tdc.checks import check_number
 
 
 def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
@@ -57,6 +58,10 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
                 raise UnsafeFileError(f"its {name} are not those of this run (buffer_size, observations, actions)")
         if not 0 <= saved["pos"] < buffer.buffer_size:
             raise UnsafeFileError(f"its position, {saved['pos']}, is outside")
+        if isinstance(buffer, HerReplayBuffer):
+            for name in ("ep_start", "ep_length", "_current_ep_start"):
+                if ((saved[name] < 0) | (saved[name] > buffer.buffer_size)).any():
+                    raise UnsafeFileError(f"its {name} are outside of the buffer")
         vars(buffer).update(saved)
         if isinstance(buffer, HerReplayBuffer):
             buffer.truncate_last_trajectory()
@@ -64,24 +69,27 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
 
 def _read_object(path: str | Path, cls: type, read_state: Callable[[Call, Rebuild], dict[str, Any]]) -> dict[str, Any]:
     """:return: what ``read_state`` takes from the one pickled object of a class that a file holds"""
-    size = Path(path).stat().st_size
-    if size > MAX_REPLAY_BYTES:
-        raise UnsafeFileError(f"it has {size:,} bytes, more than {MAX_REPLAY_BYTES:,}")
-    with Path(path).open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        saved = read_pickle(content)  # type: ignore[arg-type]  # a mapped file reads like a file
+    with open_regular(path, MAX_REPLAY_BYTES) as (file, size):
+        if size == 0:
+            raise UnsafeFileError("it is empty")
+        budget = Budget(size)
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            saved = read_pickle(content, budget)  # type: ignore[arg-type]  # a mapped file reads like a file
     if not isinstance(saved, Call) or saved.function != name_of(cls):
         raise UnsafeFileError(f"it does not hold a {cls.__name__}")
-    return rebuild(saved, {}, {**CALLS, name_of(cls): read_state})
+    return Rebuild({}, {**CALLS, name_of(cls): Handler(read_state, state=True)}, budget)(saved)
 
 
 def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
     """The keyword arguments of ``VecNormalize``, and its statistics; nothing else of the pickle is looked at."""
     state = call.state
+    if not isinstance(state, dict):
+        raise UnsafeFileError("VecNormalize without its attributes")
     fields: dict[str, Any] = {name: make(state[name]) for name in ("obs_rms", "ret_rms") if name in state}
     for name in ("training", "norm_obs", "norm_reward"):
         fields[name] = boolean(name, make(state[name]))
     for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
-        fields[name] = check_number(name, make(state[name]), 0.0)
+        fields[name] = number(0.0)(name, make(state[name]))
     keys = make(state.get("norm_obs_keys"))
     if keys is not None and not (isinstance(keys, list) and all(isinstance(key, str) for key in keys)):
         raise UnsafeFileError("norm_obs_keys that are not names")

@@ -1,66 +1,104 @@
 """Tensors, weights and states of optimizers, checked before torch or a network sees them."""
 
+import inspect
 import io
 import math
 import re
-import zipfile
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_tdc.safe_load.archives import read_archive
-from sb3_tdc.safe_load.checks import is_plain, reading
-from sb3_tdc.safe_load.inert_pickle import PERSISTENT, Call, Name, Rebuild, UnsafeFileError, read_pickle, rebuild
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, escaped, shown
+from sb3_tdc.safe_load.checks import reading
+from sb3_tdc.safe_load.inert_pickle import PERSISTENT, Call, Handler, Name, Rebuild, read_pickle
 from sb3_tdc.tdc.checks import find_non_finite
 
 _TENSOR_ENTRIES = re.compile(
     r"[\w.-]+/(data\.pkl|version|byteorder|\.format_version|\.storage_alignment|\.data/serialization_id|data/\d+)"
 )
-_STORAGE_BYTES = {
-    "DoubleStorage": 8, "FloatStorage": 4, "HalfStorage": 2, "BFloat16Storage": 2, "LongStorage": 8, "IntStorage": 4,
-    "ShortStorage": 2, "CharStorage": 1, "ByteStorage": 1, "BoolStorage": 1,
+_STORAGE_TYPES = {
+    "DoubleStorage": th.float64, "FloatStorage": th.float32, "HalfStorage": th.float16, "BFloat16Storage": th.bfloat16,
+    "LongStorage": th.int64, "IntStorage": th.int32, "ShortStorage": th.int16, "CharStorage": th.int8,
+    "ByteStorage": th.uint8, "BoolStorage": th.bool,
 }  # fmt: skip
+MAX_DIMENSIONS = 8
 
 
-def read_tensors(raw: bytes, device: th.device | str) -> Any:
+def read_tensors(raw: bytes, budget: Budget) -> Any:
     """
-    Check a ``.pth`` file, tensor by tensor, against the bytes that are there; then ``torch.load`` it.
+    Read a ``.pth`` file: tensors are made of the bytes of its records, by what its pickle says of them.
 
-    :return: what ``torch.save`` was given: numbers, texts and tensors, in dicts, lists and tuples
+    :param budget: of the file that it is in
+    :return: what ``torch.save`` was given: numbers, texts and tensors (on the CPU), in dicts, lists and tuples
     """
-    entries = read_archive(io.BytesIO(raw), _TENSOR_ENTRIES)
+    entries = read_archive(io.BytesIO(raw), _TENSOR_ENTRIES, budget)
     records = {name.partition("/")[2]: content for name, content in entries.items()}
     if "data.pkl" not in records or len(records) != len(entries):
         raise UnsafeFileError("it is not a file of tensors")
+    if records.get("byteorder", b"little") != b"little":
+        raise UnsafeFileError("its numbers are in the order of another kind of processor")
+    tensors = _Tensors(records, budget)
+    known = {
+        Name("torch._utils", "_rebuild_tensor_v2"): Handler(tensors.make, args=(6, 7)),
+        # The attributes are those of a state dict: the versions of its modules
+        Name("collections", "OrderedDict"): Handler(_make_dict, state=True, items=True),
+    }
+    return Rebuild({}, known, budget)(read_pickle(records["data.pkl"], budget))
 
-    def check_tensor(call: Call, make: Rebuild) -> th.Tensor:
-        storage, offset, shape, stride = call.args[:4]
-        if not isinstance(storage, Call) or storage.function != PERSISTENT or len(storage.args) != 5:
-            raise UnsafeFileError("a tensor without its storage")
-        kind, key, size = storage.args[1], storage.args[2], storage.args[4]
-        item = _STORAGE_BYTES.get(kind.attribute) if isinstance(kind, Name) and kind.module == "torch" else None
-        if item is None or type(size) is not int or size * item != len(records.get(f"data/{key}", b"")):
-            raise UnsafeFileError("a tensor with other bytes than it says")
-        whole = all(type(number) is int and number >= 0 for number in (offset, *shape, *stride))
+
+def _make_dict(call: Call, make: Rebuild) -> dict:
+    if call.state is not None and not (isinstance(call.state, dict) and set(call.state) == {"_metadata"}):
+        raise UnsafeFileError("a mapping with attributes")
+    return {key: make(item) for key, item in call.items}
+
+
+class _Tensors:
+    """The storages of one file. A storage has one type, and all tensors that name it are parts of the same memory."""
+
+    def __init__(self, records: dict[str, bytes], budget: Budget):
+        self.records, self.budget = records, budget
+        self.storages: dict[str, th.Tensor] = {}
+
+    def make(self, call: Call, make: Rebuild) -> th.Tensor:
+        """:return: the part of a storage that a call of ``_rebuild_tensor_v2`` describes"""
+        storage, offset, shape, stride, requires_grad, hooks, *metadata = call.args
+        flat = self._storage(storage)
+        numbers = (offset, *shape, *stride) if isinstance(shape, tuple) and isinstance(stride, tuple) else (-1,)
+        whole = all(type(number) is int and 0 <= number <= flat.numel() for number in numbers)
+        if not whole or len(shape) > MAX_DIMENSIONS or len(shape) != len(stride):
+            raise UnsafeFileError("a tensor of a shape that it cannot have")
+        size = math.prod(shape)
         contiguous = tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
-        if not whole or (math.prod(shape) > 1 and stride != contiguous) or offset + math.prod(shape) > size:
-            raise UnsafeFileError("a tensor that is larger than its storage")
-        return th.empty(0)
+        if (size > 1 and stride != contiguous) or offset + size > flat.numel():
+            raise UnsafeFileError("a tensor that is larger than its storage, or not stored in a row")
+        has_hooks = make(hooks) != {} or any(part not in (None, {}) for part in metadata)
+        if not isinstance(requires_grad, bool) or has_hooks:
+            raise UnsafeFileError("a tensor with hooks or attributes")
+        return flat[offset : offset + size].view(shape)
 
-    def check_dict(call: Call, make: Rebuild) -> dict:
-        if call.args != () or (call.state is not None and set(call.state) != {"_metadata"}):
-            raise UnsafeFileError("a mapping with attributes")
-        return {key: make(item) for key, item in call.items}
-
-    known = {Name("torch._utils", "_rebuild_tensor_v2"): check_tensor, Name("collections", "OrderedDict"): check_dict}
-    rebuild(read_pickle(records["data.pkl"]), {}, known)
-    repacked = io.BytesIO()  # so that torch sees the entries that were checked, and no others
-    with zipfile.ZipFile(repacked, "w") as archive:
-        for name, content in records.items():
-            archive.writestr(f"archive/{name}", content)
-    repacked.seek(0)
-    return th.load(repacked, map_location=th.device("cpu") if device == "auto" else device, weights_only=True)
+    def _storage(self, storage: Any) -> th.Tensor:
+        """:return: (size,), of its type"""
+        is_call = isinstance(storage, Call) and storage.function == PERSISTENT and storage.state is None
+        if not is_call or not isinstance(storage.args, tuple) or len(storage.args) != 5:
+            raise UnsafeFileError("a tensor without its storage")
+        tag, kind, key, location, size = storage.args
+        dtype = _STORAGE_TYPES.get(kind.attribute) if isinstance(kind, Name) and kind.module == "torch" else None
+        if tag != "storage" or dtype is None or not isinstance(key, str) or not isinstance(location, str):
+            raise UnsafeFileError("a storage of an unknown kind")
+        content = self.records.get(f"data/{key}", b"")
+        if type(size) is not int or size * dtype.itemsize != len(content):
+            raise UnsafeFileError("a tensor with other bytes than it says")
+        if key not in self.storages:
+            self.budget.take_bytes(len(content))
+            if dtype == th.bool and content.strip(b"\0\1"):
+                raise UnsafeFileError("booleans that are neither true nor false")
+            # Of its own memory: what is in the file cannot be written to
+            self.storages[key] = th.frombuffer(bytearray(content), dtype=dtype) if content else th.empty(0, dtype=dtype)
+        if self.storages[key].dtype != dtype:
+            raise UnsafeFileError("a storage that is said to be of two types")
+        return self.storages[key]
 
 
 class _OnMeta:
@@ -86,41 +124,78 @@ def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weight
     if not isinstance(weights, dict) or not all(isinstance(tensor, th.Tensor) for tensor in weights.values()):
         raise UnsafeFileError("policy.pth: it does not hold weights")
     found = {name: tuple(tensor.shape) for name, tensor in weights.items()}
+    types = {name: tensor.dtype for name, tensor in policy.state_dict().items()}
     for name in [*expected, *found]:
         if expected.get(name) != found.get(name):
             raise UnsafeFileError(
-                f"policy.pth: {str(name)[:100]} is {found.get(name, 'missing')}, but the environment and policy_kwargs "
-                f"make it {expected.get(name, 'nothing')}"
+                f"policy.pth: {escaped(str(name))} is {found.get(name, 'missing')}, but the environment and "
+                f"policy_kwargs make it {expected.get(name, 'nothing')}"
             )
+        if weights[name].dtype != types[name]:
+            raise UnsafeFileError(f"policy.pth: {escaped(str(name))} is of {weights[name].dtype}, not of {types[name]}")
     for name in find_non_finite(policy, weights):
-        raise UnsafeFileError(f"policy.pth: {name} has values that are not finite")
-
-
-_OF_THE_SHAPE_OF_ITS_PARAMETER = {
-    "exp_avg", "exp_avg_sq", "max_exp_avg_sq", "exp_inf", "square_avg", "grad_avg", "momentum_buffer",
-}  # fmt: skip
-_OF_ONE_NUMBER = {"step", "mu_product"}
+        raise UnsafeFileError(f"policy.pth: {escaped(str(name))} has values that are not finite")
 
 
 def check_optimizer(optimizer: th.optim.Optimizer, saved: Any) -> None:
-    """:raises UnsafeFileError: unless the saved state is that of this optimizer's parameters"""
-    groups = saved["param_groups"]
-    if set(saved) != {"state", "param_groups"} or len(groups) != len(optimizer.param_groups):
+    """:raises UnsafeFileError: unless the saved state is one that this optimizer has after some steps, or before any"""
+    if not isinstance(saved, dict) or set(saved) != {"state", "param_groups"}:
+        raise UnsafeFileError("it is not the state of an optimizer")
+    groups, states = saved["param_groups"], saved["state"]
+    if not isinstance(groups, list) or len(groups) != len(optimizer.param_groups) or not isinstance(states, dict):
         raise UnsafeFileError("it is not the state of this optimizer")
     parameters: list[th.Tensor] = []
     for group, fresh in zip(groups, optimizer.param_groups, strict=True):
         first, n = len(parameters), len(fresh["params"])
-        if group["params"] != list(range(first, first + n)):
+        if not isinstance(group, dict) or group.get("params") != list(range(first, first + n)):
             raise UnsafeFileError("it is of other parameters")
         parameters += fresh["params"]
-        for name, value in group.items():
-            if name != "params" and (name not in fresh or not is_plain(value)):
-                raise UnsafeFileError(f"its {str(name)[:100]!r} is unknown, or is not a finite number")
-    for index, state in saved["state"].items():
+        for name in {*group, *fresh} - {"params"}:
+            # An older PyTorch wrote fewer of them, and load_state_dict takes the defaults
+            if name in group and (name not in fresh or not _is_like(group[name], fresh[name])):
+                raise UnsafeFileError(f"its {shown(name)} is unknown, or is not what it can be")
+    expected = _state_after_a_step(optimizer)
+    for index, state in states.items():
+        if type(index) is not int or not 0 <= index < len(parameters) or not isinstance(state, dict):
+            raise UnsafeFileError("it has a state of a parameter that there is not")
+        if set(state) != set(expected):
+            raise UnsafeFileError(f"its state of parameter {index} lacks a part, or has an unknown one")
         for name, value in state.items():
-            shape = parameters[index].shape
-            fits = (name in _OF_THE_SHAPE_OF_ITS_PARAMETER and value.shape == shape) or (
-                name in _OF_ONE_NUMBER and (not isinstance(value, th.Tensor) or value.numel() == 1)
-            )
-            if value is not None and not fits:
-                raise UnsafeFileError(f"its {str(name)[:100]!r} of parameter {index} is unknown, or of another shape")
+            if not _is_state(value, expected[name], parameters[index].shape):
+                raise UnsafeFileError(f"its {shown(name)} of parameter {index} is not what it can be")
+
+
+def _state_after_a_step(optimizer: th.optim.Optimizer) -> dict[str, Any]:
+    """:return: what this optimizer keeps of a parameter, for one of shape (2,)"""
+    parameter = th.zeros(2, requires_grad=True)
+    kind: Any = type(optimizer)
+    taken = inspect.signature(kind).parameters
+    options = {name: optimizer.param_groups[0][name] for name in optimizer.defaults if name in taken}
+    tried = kind([parameter], **options)
+    parameter.grad = th.zeros(2)
+    tried.step()
+    return dict(tried.state[parameter])
+
+
+def _is_state(value: Any, expected: Any, shape: th.Size) -> bool:
+    if expected is None or value is None:
+        return value is expected
+    is_number = not isinstance(expected, th.Tensor) or expected.numel() == 1
+    if is_number and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return math.isfinite(value) and value >= 0
+    if not isinstance(value, th.Tensor) or not value.dtype.is_floating_point:
+        return False
+    fits = value.numel() == 1 if is_number else value.shape == shape
+    return fits and bool(value.isfinite().all()) and not (is_number and value.item() < 0)
+
+
+def _is_like(value: Any, fresh: Any) -> bool:
+    """Whether an option is of the kind that the optimizer has: a number for a number, true or false for these."""
+    if isinstance(value, bool) or isinstance(fresh, bool):
+        return isinstance(value, bool | None) and isinstance(fresh, bool | None)
+    if isinstance(fresh, (int, float)):
+        return isinstance(value, (int, float)) and math.isfinite(value) and abs(value) < 2**31
+    if isinstance(fresh, tuple):
+        same_length = isinstance(value, (tuple, list)) and len(value) == len(fresh)
+        return same_length and all(map(_is_like, value, fresh))
+    return value is None or (fresh is None and isinstance(value, (int, float)) and math.isfinite(value))

@@ -28,9 +28,12 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.her import GoalSelectionStrategy
 
 from sb3_tdc import TDC, UnsafeFileError, enjoy, load_safely
-from sb3_tdc.safe_load import load_normalization, load_replay_buffer
+from sb3_tdc.safe_load import inspect, load_normalization, load_replay_buffer
+from sb3_tdc.safe_load.budget import Budget
+from sb3_tdc.safe_load.fields import REQUIRED, REQUIRED_OF
 from sb3_tdc.safe_load.inert_pickle import read_pickle
 from tests.test_command_line import SMALL, run_enjoy, run_train
 
@@ -310,12 +313,12 @@ def test_odd_values_give_one_sentence(saved, tmp_path, value):
         ({"policy_kwargs": {"net_arch": [8, 8], "n_quantiles": 10**9}}, "critic.layers.4.weight"),
         ({"policy_kwargs": {"net_arch": [10**9, 10**9]}}, "actor.latent_pi.0.weight"),
         ({"policy_kwargs": {"net_arch": [8] * 100_000}}, "policy_kwargs"),
-        ({"policy_kwargs": {"net_arch": [8, 8], "n_critics": 10**8}}, "n_critics must be at most"),
+        ({"policy_kwargs": {"net_arch": [8, 8], "n_critics": 10**8}}, "n_critics must be an integer from 1 to 256"),
         ({"policy_kwargs": {"net_arch": [8, 8], "n_quantiles": 10**30}}, "policy_kwargs"),
         ({"policy_kwargs": {"net_arch": [8, 8], "features_extractor_class": "os.system"}}, "policy_kwargs"),
         ({"policy_kwargs": {"net_arch": [8, 8], "surprise": 1}}, "unknown key 'surprise'"),
         ({"buffer_size": 10**12}, "give a smaller buffer_size"),
-        ({"n_envs": 10**9}, "n_envs must be at most"),
+        ({"n_envs": 10**9}, "n_envs must be an integer from 1 to 10,000"),
         ({"policy_class": "sb3_tdc.tdc.policies.TDCPolicy"}, "policy_class"),
         ({"replay_buffer_class": serialized(TDC)}, "replay_buffer_class"),
         ({"unknown": 1}, "'unknown' is unknown"),
@@ -331,7 +334,8 @@ def test_a_smaller_buffer_than_the_files(saved, tmp_path):
 
 
 def test_json_too_deep_or_with_a_field_twice(saved, tmp_path):
-    assert "recursion" in refuse(rewrite(saved, tmp_path / "x.zip", data="[" * 10**6))
+    assert "recursion" in refuse(rewrite(saved, tmp_path / "x.zip", data="[" * 10**5))
+    assert "too many values" in refuse(rewrite(saved, tmp_path / "x.zip", data="[" * 10**6))
     assert "twice" in refuse(rewrite(saved, tmp_path / "x.zip", data='{"tau": 0.1, "tau": 0.2}'))
     refuse(rewrite(saved, tmp_path / "x.zip", data='{"tau": %s}' % ("9" * 10**5)))
     refuse(rewrite(saved, tmp_path / "x.zip", data="3"))
@@ -392,7 +396,9 @@ def test_tensors_that_say_more_than_their_bytes_are_refused(saved, tmp_path):
         poisoned = rewrite_bytes(raw, "data.pkl", tree.replace(numbers, lie))
         assert "a tensor with other bytes" in refuse(rewrite(saved, tmp_path / "x.zip", **{"policy.pth": poisoned}))
     huge = th.zeros(1).expand(10**12)  # one number, a stride of 0
-    assert "larger than its storage" in refuse(rewrite(saved, tmp_path / "x.zip", **{"policy.pth": pth({"w": huge})}))
+    assert "a shape that it cannot have" in refuse(
+        rewrite(saved, tmp_path / "x.zip", **{"policy.pth": pth({"w": huge})})
+    )
 
 
 def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
@@ -410,8 +416,13 @@ def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
     refuse_with("policy.pth", {k: v for k, v in weights.items() if k != first}, f"{first} is missing")
     refuse_with("policy.pth", {**weights, "more": th.zeros(1)}, "more is")
     for change, match in (
-        (lambda s: s["state"][0].update(exp_avg=th.zeros(1)), "'exp_avg' of parameter 0"),
-        (lambda s: s["state"][0].update(surprise=th.zeros(1)), "'surprise'"),
+        (lambda s: s["state"][0].update(exp_avg=th.zeros(1)), "'exp_avg' of parameter 0 is not what it can be"),
+        (lambda s: s["state"][0].pop("exp_avg"), "state of parameter 0 lacks a part"),
+        (lambda s: s["state"][0].update(step=th.tensor(float("nan"))), "'step' of parameter 0 is not"),
+        (lambda s: s["state"].update({-1: s["state"][0]}), "a parameter that there is not"),
+        (lambda s: s["param_groups"][0].update(betas=("a", "b")), "'betas' is unknown, or is not"),
+        (lambda s: s["param_groups"][0].update(lr=True), "'lr' is unknown, or is not"),
+        (lambda s: s["state"][0].update(surprise=th.zeros(1)), "has an unknown one"),
         (lambda s: s["state"].update({99: s["state"][0]}), "."),
         (lambda s: s["param_groups"][0].update(lr=float("inf")), "'lr'"),
         (lambda s: s["param_groups"][0].update(surprise=1), "'surprise'"),
@@ -422,7 +433,11 @@ def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
         change(changed)
         refuse_with("actor.optimizer.pth", changed, match)
     refuse_with("pytorch_variables.pth", {"log_ent_coef": th.zeros(7)}, "another shape")
-    refuse_with("pytorch_variables.pth", {"policy": th.zeros(1)}, "policy: it is unknown")
+    refuse_with("pytorch_variables.pth", {"policy": th.zeros(1)}, "log_ent_coef is missing")
+    variables = state("pytorch_variables.pth")
+    refuse_with("pytorch_variables.pth", {**variables, "policy": th.zeros(1)}, "'policy': it is unknown")
+    refuse_with("policy.pth", {**weights, first: weights[first].double()}, "is of torch.float64")
+    assert "log_ent_coef is missing" in refuse(rewrite(saved, tmp_path / "x.zip", **{"pytorch_variables.pth": None}))
 
 
 # -------------------------------------------------------------------- zips
@@ -465,7 +480,7 @@ def test_zip_bombs_are_refused_unread(saved, tmp_path, monkeypatch):
     entry = lie.rindex(b"PK\1\2")
     struct.pack_into("<LL", lie, entry + 20, 2**32 - 2, 2**32 - 2)
     path.write_bytes(lie)
-    assert "holds more than" in refuse(path)
+    assert "far more memory than it has bytes" in refuse(path)
 
 
 def test_a_compressed_copy_opens(saved, tmp_path):
@@ -538,7 +553,7 @@ def test_any_bytes_are_read_as_a_pickle_or_refused(raw, data):
     for place in data.draw(st.lists(st.integers(0, max(len(raw) - 1, 0)), max_size=3)) if raw else []:
         content[place] = data.draw(st.integers(0, 255))
     with contextlib.suppress(UnsafeFileError):
-        read_pickle(bytes(content))
+        read_pickle(bytes(content), Budget(10_000))
 
 
 def test_pickles_that_grow_are_refused(saved, tmp_path):
@@ -732,3 +747,80 @@ def test_a_folder_of_rl_zoo_opens(tmp_path, monkeypatch, capsys):
         assert run_enjoy(tmp_path / "td3" / "Pendulum-v1_1", *arguments) == 0
         assert "mean ± std of 2 episodes" in capsys.readouterr().out
     assert enjoy.make_parser().parse_args(["x"]).trust is False
+
+
+# -------------------------------------------------------------------- code in fields that are not read, and inspection
+
+
+def test_code_in_a_field_that_is_not_read_is_named(saved, tmp_path, marker):
+    path = with_fields(saved, tmp_path / "x.zip", lr_schedule=serialized(Poison()), _last_obs=serialized(np.zeros(3)))
+    with pytest.warns(
+        RuntimeWarning, match=r"The field 'lr_schedule' is not read here, but .* builtins\.exec$"
+    ) as told:
+        assert load_safely(path, device="cpu").num_timesteps > 0
+    assert len([w for w in told if issubclass(w.category, RuntimeWarning)]) == 1
+    with pytest.warns(RuntimeWarning, match=r"The field 'lam' is not read here"):
+        load_safely(with_fields(saved, path, lam=serialized(Poison())), device="cpu", custom_objects={"lam": 0.5})
+    assert not marker.exists()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("name", ["tdc", "td3-vectorized-noise", "sac", "ddpg"])
+def test_nothing_is_named_of_what_sb3_writes(tmp_path, name):
+    MODELS[name]().save(tmp_path / "model.zip")
+    load_safely(tmp_path / "model.zip", device="cpu")
+
+
+def test_a_strategy_of_hindsight_as_an_enum(tmp_path):
+    kwargs = {**HER, "replay_buffer_kwargs": {"goal_selection_strategy": GoalSelectionStrategy.FINAL}}
+    TDC("MultiInputPolicy", goal_env(), **kwargs, **TINY).learn(40).save(tmp_path / "model.zip")
+    model = load_safely(tmp_path / "model.zip", goal_env(), device="cpu")
+    assert model.replay_buffer.goal_selection_strategy is GoalSelectionStrategy.FINAL
+
+
+def inspected(path, capsys):
+    status = inspect.main([str(path)])
+    return status, capsys.readouterr().out
+
+
+def test_a_file_can_be_inspected(saved, tmp_path, marker, capsys):
+    status, out = inspected(saved, capsys)
+    assert status == 0
+    assert re.search(r"policy\.pth +[\d,]+ bytes", out)
+    assert "Code: none that SB3's own load would import" in out
+    assert "Would be opened as a TDC of 60 steps." in out
+
+    path = with_fields(saved, tmp_path / "x.zip", lr_schedule=serialized(Poison()), lam=serialized(lambda left: 1.0))
+    status, out = inspected(path, capsys)
+    assert status == 1
+    assert re.search(r"lr_schedule +builtins\.exec\n", out)
+    assert re.search(r"lam +cloudpickle\.", out)
+    assert "Refused: the field lam" in out
+    assert len(out.splitlines()) < 30
+    assert not marker.exists()
+
+
+def test_statistics_buffers_and_folders_can_be_inspected(run, tmp_path, marker, capsys):
+    assert inspected(run, capsys)[0] == 0
+    (tmp_path / "stats.pkl").write_bytes(pickle.dumps(frames()))
+    status, out = inspected(tmp_path / "stats.pkl", capsys)
+    assert "a pickle of stable_baselines3.common.vec_env.vec_normalize.VecNormalize" in out
+    (tmp_path / "evil.pkl").write_bytes(pickle.dumps(Poison()))
+    status, out = inspected(tmp_path / "evil.pkl", capsys)
+    assert (status, "Refused: builtins.exec is not known here." in out) == (1, True)
+    assert inspect.main([str(tmp_path / "nothing")]) == 2
+    assert inspect.main([]) == 2
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if not name.startswith("ddpg")])
+def test_every_field_that_is_required_is_written_by_sb3_and_refused_without(tmp_path, name):
+    MODELS[name]().save(tmp_path / "model.zip")
+    fields = fields_of(tmp_path / "model.zip")
+    algorithm = {"tdc": "TDC", "td3": "TD3", "sac": "SAC"}[name.split("-")[0]]
+    for required in (*REQUIRED, *REQUIRED_OF[algorithm]):
+        assert required in fields
+    left_out = sorted({*REQUIRED, *REQUIRED_OF[algorithm]})[sum(map(ord, name)) % 10]  # another one for each model
+    data = {field: value for field, value in fields.items() if field != left_out}
+    error = refuse(rewrite(tmp_path / "model.zip", tmp_path / "x.zip", data=json.dumps(data)))
+    assert f"the field {left_out} is missing" in error or left_out == "policy_class"

@@ -1,0 +1,5 @@
+import sys
+
+from sb3_tdc.safe_load.inspect import main
+
+sys.exit(main())

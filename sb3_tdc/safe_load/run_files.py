@@ -1,0 +1,94 @@
+"""What the YAML files of a downloaded run may ask for: arguments of the right types, and wrappers that only wrap."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from sb3_tdc.safe_load.budget import escaped, shown
+
+# Classes that write no file and start no process, by the module that they are in or below
+_WRAPPERS: dict[str, set[str]] = {
+    "gymnasium.wrappers": {
+        *("AddRenderObservation", "AddWhiteNoise", "AtariPreprocessing", "Autoreset", "ClipAction", "ClipReward"),
+        *("DelayObservation", "DiscretizeAction", "DiscretizeObservation", "DtypeObservation", "FilterObservation"),
+        *("FlattenObservation", "FrameStackObservation", "GrayscaleObservation", "HumanRendering", "OrderEnforcing"),
+        *("MaxAndSkipObservation", "NormalizeObservation", "NormalizeReward", "ObstructView", "PassiveEnvChecker"),
+        *("RecordEpisodeStatistics", "RenderCollection", "RepeatAction", "RescaleAction", "RescaleObservation"),
+        *("ReshapeObservation", "ResizeObservation", "StickyAction", "TimeAwareObservation", "TimeLimit"),
+    },
+    "stable_baselines3.common.vec_env": {
+        *("VecCheckNan", "VecExtractDictObs", "VecFrameStack", "VecMonitor", "VecNormalize", "VecTransposeImage"),
+    },
+    "stable_baselines3.common.monitor": {"Monitor"},
+    "stable_baselines3.common.atari_wrappers": {
+        *("AtariWrapper", "ClipRewardEnv", "EpisodicLifeEnv", "FireResetEnv", "MaxAndSkipEnv", "NoopResetEnv"),
+        *("StickyActionEnv", "WarpFrame"),
+    },
+    "sb3_contrib.common.wrappers": {"TimeFeatureWrapper"},
+    "rl_zoo3.wrappers": {
+        *("ActionNoiseWrapper", "ActionSmoothingWrapper", "DelayedRewardWrapper", "FrameSkip", "HistoryWrapper"),
+        *("HistoryWrapperObsDict", "MaskVelocityWrapper", "TimeFeatureWrapper", "TruncatedOnSuccessWrapper"),
+        *("YAMLCompatResizeObservation", "ResizeObservation"),
+    },
+}
+_NAMES_A_FILE = re.compile("file|path|folder|dir", re.IGNORECASE)
+_ARGUMENTS: dict[str, tuple[type, ...]] = {
+    "algo": (str,),
+    "env": (str,),
+    "gym_packages": (list,),
+    "env_kwargs": (dict, type(None)),
+}
+
+
+def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where: str) -> None:
+    """
+    :param args: of ``args.yml``
+    :param where: its path, for the error
+    :raises ValueError: if one that is needed is missing, or of another type
+    """
+    for name, kinds in _ARGUMENTS.items():
+        if name not in args or not isinstance(args[name], kinds):
+            found = shown(args[name]) if name in args else "nothing"
+            kind = "a text" if str in kinds else "a list" if list in kinds else "a mapping"
+            raise ValueError(f"{where}: {name} must be {kind}, got {found}")
+    if not all(isinstance(package, str) for package in args["gym_packages"]):
+        raise ValueError(f"{where}: gym_packages must be names")
+    if args["algo"] not in algorithms:
+        raise ValueError(f"{where}: algo must be one of {', '.join(algorithms)}, got {shown(args['algo'])}")
+
+
+def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str], where: str) -> None:
+    """
+    :param args: of ``args.yml``
+    :param config: of ``config.yml``
+    :param consented: packages and modules that the user has named
+    :raises ValueError: if the files name code to import that is neither known to be harmless nor consented to
+    """
+    package, _, _ = args["env"].rpartition(":")
+    for name in [*args["gym_packages"], *([package] if package else [])]:
+        if name not in consented:
+            raise ValueError(
+                f"{where} asks for the package {escaped(name)}: if you know it, add --gym-packages {escaped(name)}"
+            )
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        wrappers = config.get(key) or []
+        for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
+            for name, kwargs in wrapper.items() if isinstance(wrapper, dict) else [(wrapper, None)]:
+                if any(str(name).startswith(f"{prefix}.") for prefix in consented):
+                    continue
+                if not _is_known(str(name)):
+                    raise ValueError(
+                        f"{where} asks for {key} {escaped(str(name))}: if you know it, add its module to --gym-packages"
+                    )
+                for argument in kwargs or {} if isinstance(kwargs, dict | None) else [kwargs]:
+                    if not isinstance(argument, str) or _NAMES_A_FILE.search(argument):
+                        raise ValueError(
+                            f"{where} asks for {key} {escaped(str(name))} with {shown(argument)}, which may write a file: "
+                            "if you know it, add its module to --gym-packages"
+                        )
+
+
+def _is_known(name: str) -> bool:
+    module, _, cls = name.rpartition(".")
+    roots = [root for root in _WRAPPERS if module == root or module.startswith(f"{root}.")]
+    return any(cls in _WRAPPERS[root] for root in roots)

@@ -1,0 +1,105 @@
+"""Pickled fields that hang a reader, fill its memory, or drive the terminal that shows the refusal."""
+
+from tests.safe_load.attacks.tools import Op, pickled, with_fields
+
+FIELDS = (
+    *("policy_class", "policy_kwargs", "observation_space", "action_space", "learning_rate", "lam", "action_noise"),
+    *("train_freq", "replay_buffer_class", "replay_buffer_kwargs", "ent_coef", "seed", "gamma", "num_timesteps"),
+)
+
+
+def doubled(container: bytes = Op.EMPTY_LIST, add: bytes = Op.APPENDS, times: int = 50) -> bytes:
+    """A list of two references to a list of two references to …: 2**50 values in some hundred bytes."""
+    raw = Op.PROTO + container + Op.put(0)
+    for i in range(times):
+        raw += container + Op.put(i + 1) + Op.MARK + Op.get(i) + Op.get(i) + add
+    return raw + Op.STOP
+
+
+def doubled_tuples() -> bytes:
+    raw = Op.PROTO + Op.EMPTY_TUPLE + Op.put(0)
+    for i in range(50):
+        raw += Op.tuple_of(Op.get(i), Op.get(i)) + Op.put(i + 1)
+    return raw + Op.STOP
+
+
+def doubled_dicts() -> bytes:
+    raw = Op.PROTO + Op.EMPTY_DICT + Op.put(0)
+    for i in range(50):
+        raw += (
+            Op.EMPTY_DICT + Op.put(i + 1) + Op.MARK + Op.text("a") + Op.get(i) + Op.text("b") + Op.get(i) + Op.SETITEMS
+        )
+    return raw + Op.STOP
+
+
+def colliding(n: int = 60_000) -> bytes:
+    """Keys whose hashes are all the same: multiples of the modulus of Python's hash of integers."""
+    keys = b"".join(_long(i * (2**61 - 1)) + Op.NONE for i in range(1, n))
+    return Op.PROTO + Op.EMPTY_DICT + Op.MARK + keys + Op.SETITEMS + Op.STOP
+
+
+def _long(value: int) -> bytes:
+    raw = value.to_bytes((value.bit_length() + 8) // 8, "little", signed=True)
+    return b"\x8a" + bytes([len(raw)]) + raw
+
+
+def many_operations() -> bytes:
+    return Op.PROTO + (Op.NONE + Op.POP) * 5_000_000 + Op.NONE + Op.STOP
+
+
+def large_integer() -> bytes:
+    return Op.PROTO + b"\x8b" + (2**22).to_bytes(4, "little") + b"\x7f" * 2**22 + Op.STOP
+
+
+def long_name() -> bytes:
+    return Op.PROTO + Op.name("m" * 10**7, "\x1b[2J\x1b]0;owned\x07") + Op.STOP
+
+
+def colliding_in_a_set() -> bytes:
+    keys = b"".join(_long(i * (2**61 - 1)) for i in range(1, 60_000))
+    return b"\x80\x04" + b"\x8f" + Op.MARK + keys + b"\x90" + Op.STOP
+
+
+def text_as_key() -> bytes:
+    return Op.PROTO + Op.EMPTY_DICT + Op.text("\x1b[31m" + "k" * 10**7) + Op.NONE + Op.SETITEM + Op.STOP
+
+
+def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
+    """One array, and many spaces that each copy it."""
+    array = Op.name("numpy._core.numeric", "_frombuffer")
+    data = b"B" + size.to_bytes(4, "little") + bytes(size)
+    dtype = Op.name("numpy", "dtype") + Op.tuple_of(Op.text("f4"), Op.FALSE, Op.TRUE) + Op.REDUCE
+    array += Op.tuple_of(data, dtype, Op.tuple_of(Op.integer(size // 4)), Op.text("C")) + Op.REDUCE + Op.put(1)
+    box = Op.name("gymnasium.spaces.box", "Box") + Op.EMPTY_TUPLE + b"\x81" + Op.EMPTY_DICT + Op.MARK
+    box += Op.text("low") + Op.get(1) + Op.text("high") + Op.get(1) + Op.SETITEMS + Op.BUILD
+    spaces = b"".join(Op.text(f"{i}") + box for i in range(n))
+    raw = (
+        Op.PROTO + array + Op.POP + Op.name("gymnasium.spaces.dict", "Dict") + Op.EMPTY_TUPLE + b"\x81" + Op.EMPTY_DICT
+    )
+    raw += Op.text("spaces") + Op.EMPTY_DICT + Op.MARK + spaces + Op.SETITEMS + Op.SETITEM + Op.BUILD
+    return raw + Op.STOP
+
+
+RAW = {
+    "lists doubled": doubled,
+    "tuples doubled": doubled_tuples,
+    "dicts doubled": doubled_dicts,
+    "colliding keys": colliding,
+    "colliding keys in a set": colliding_in_a_set,
+    "ten million operations": many_operations,
+    "an integer of four million bytes": large_integer,
+    "a name of ten million letters that clears the screen": long_name,
+    "a key of ten million letters": text_as_key,
+}
+ATTACKS = {
+    **{
+        f"{name} in {field}": lambda folder, model, raw=raw, field=field: with_fields(
+            model, folder / "x.zip", **{field: pickled(raw())}
+        )
+        for name, raw in RAW.items()
+        for field in (FIELDS if name.endswith("doubled") else ("policy_kwargs", "_last_obs"))
+    },
+    "sixty boxes of one array": lambda folder, model: with_fields(
+        model, folder / "x.zip", observation_space=pickled(boxes_of_one_array())
+    ),
+}

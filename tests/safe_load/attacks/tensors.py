@@ -1,0 +1,66 @@
+"""Files of tensors whose pickle says something else than their bytes."""
+
+import io
+import zipfile
+
+import torch as th
+
+from tests.safe_load.attacks.tools import Op, pth, rewrite, tensor
+
+
+def _policy(tree: bytes, **records: bytes):
+    """In the place of all weights."""
+    named = Op.PROTO + Op.EMPTY_DICT + Op.text("w") + tree + Op.SETITEM + Op.STOP
+    return lambda folder, model: rewrite(model, folder / "x.zip", **{"policy.pth": pth(named, **records)})
+
+
+def changed(name, change):
+    """The state of an optimizer, or the like, changed."""
+
+    def make(folder, model):
+        with zipfile.ZipFile(model) as archive:
+            state = th.load(io.BytesIO(archive.read(name)), weights_only=True)
+        result = change(state)
+        state = result if isinstance(result, (dict, list)) else state
+        file = io.BytesIO()
+        th.save(state, file)
+        return rewrite(model, folder / "x.zip", **{name: file.getvalue()})
+
+    return make
+
+
+_NUMBERS = bytes(40)
+_GOOD = tensor(10, (10,), (1,))
+_SET = Op.name("torch", "Tensor.set_") + Op.tuple_of(_GOOD, _GOOD) + Op.REDUCE
+_HUGE_BYTEARRAY = Op.name("builtins", "bytearray") + Op.tuple_of(Op.integer(2**31 - 1)) + Op.REDUCE
+ATTACKS = {
+    "a hundred thousand dimensions": _policy(tensor(10, (1,) * 100_000, (1,) * 100_000), data_0=_NUMBERS),
+    "dimensions whose product overflows": _policy(tensor(10, (2**40, 2**40), (2**40, 1)), data_0=_NUMBERS),
+    "a stride of zero": _policy(tensor(1, (8000, 8000), (0, 0)), data_0=bytes(4)),
+    "a stride that overlaps": _policy(tensor(10, (8, 8), (1, 0)), data_0=_NUMBERS),
+    "negative numbers": _policy(tensor(10, (-1,), (1,)), data_0=_NUMBERS),
+    "a storage beyond its record": _policy(tensor(1000, (1000,), (1,)), data_0=_NUMBERS),
+    "a storage without a record": _policy(tensor(10, (10,), (1,))),
+    "a storage of two types": _policy(Op.tuple_of(_GOOD, tensor(5, (5,), (1,), kind="DoubleStorage")), data_0=_NUMBERS),
+    "BUILD on a tensor": _policy(_GOOD + Op.tuple_of(_SET) + Op.BUILD, data_0=_NUMBERS),
+    "BUILD on a tensor with a mapping": _policy(
+        _GOOD + Op.EMPTY_DICT + Op.text("data") + _GOOD + Op.SETITEM + Op.BUILD, data_0=_NUMBERS
+    ),
+    "a call instead of a tensor": _policy(_SET, data_0=_NUMBERS),
+    "a bytearray of 2 GiB": _policy(_HUGE_BYTEARRAY, data_0=_NUMBERS),
+    "a bytearray of 2 GiB in an argument": _policy(tensor(10, (10,), (1,), more=_HUGE_BYTEARRAY), data_0=_NUMBERS),
+    "two arguments too many": _policy(tensor(10, (10,), (1,), more=Op.NONE + Op.NONE), data_0=_NUMBERS),
+    "items appended to a tensor": _policy(_GOOD + Op.NONE + Op.APPEND, data_0=_NUMBERS),
+    "no exp_avg": changed("actor.optimizer.pth", lambda s: s["state"][0].pop("exp_avg")),
+    "betas of text": changed("actor.optimizer.pth", lambda s: s["param_groups"][0].update(betas=("a", "b"))),
+    "a step that is NaN": changed("actor.optimizer.pth", lambda s: s["state"][0].update(step=th.tensor(th.nan))),
+    "a state of parameter -1": changed("actor.optimizer.pth", lambda s: s["state"].update({-1: s["state"][0]})),
+    "moments that are infinite": changed(
+        "critic.optimizer.pth", lambda s: s["state"][0].update(exp_avg=s["state"][0]["exp_avg"] + th.inf)
+    ),
+    "no temperature": lambda folder, model: rewrite(model, folder / "x.zip", **{"pytorch_variables.pth": None}),
+    "a temperature that is None": changed("pytorch_variables.pth", lambda s: dict.fromkeys(s)),
+    "weights that are a list": changed("policy.pth", lambda s: list(s.values())),
+    "weights of another type": changed("policy.pth", lambda s: {name: value.half() for name, value in s.items()}),
+    "numbers in the order of another processor": _policy(_GOOD, data_0=_NUMBERS, byteorder=b"big"),
+}

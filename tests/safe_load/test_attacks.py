@@ -1,0 +1,40 @@
+"""Every attack is refused in one printable sentence, within seconds and some hundred MiB, and leaves nothing behind."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.safe_load.attacks import ATTACKS
+from tests.safe_load.test_safe_load import MODELS
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    """Of all attacks, in a child whose memory is measured."""
+    folder = tmp_path_factory.mktemp("attacks")
+    (folder / "empty").mkdir()
+    MODELS["tdc-stochastic"]().save(folder / "model.zip")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "tests.safe_load.attacks", str(folder / "model.zip")]
+    child = subprocess.run(command, cwd=folder / "empty", env=environment, capture_output=True, text=True, check=False)
+    assert child.returncode == 0, child.stderr
+    return json.loads(child.stdout)
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_an_attack(outcomes, name):
+    outcome = outcomes[name]
+    message = outcome["message"].strip()
+    assert message != "opened" or name.endswith("in _last_obs")  # a field that is not read
+    assert message.isprintable(), message
+    assert len(message) < 1500
+    assert "Traceback" not in message
+    assert outcome["seconds"] < 5
+    assert outcome["mebibytes"] < 500
+    assert outcome["left"] == []
