@@ -83,8 +83,8 @@ def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented:
                 for argument in kwargs or {} if isinstance(kwargs, dict | None) else [kwargs]:
                     if not isinstance(argument, str) or _NAMES_A_FILE.search(argument):
                         raise ValueError(
-                            f"{where} asks for {key} {escaped(str(name))} with {shown(argument)}, which may write a file: "
-                            "if you know it, add its module to --gym-packages"
+                            f"{where} asks for {key} {escaped(str(name))} with {shown(argument)}, which may write a "
+                            "file: if you know it, add its module to --gym-packages"
                         )
 
 
