@@ -31,6 +31,8 @@ class Broken(io.StringIO):
 
 def start(folder, steps, environment=None, **streams):
     command = [sys.executable, "-W", "ignore", str(ROOT / "train.py"), *OPTIONS, "-n", str(steps), "-f", str(folder)]
+    # The suite itself may run below nohup
+    streams = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL), **streams}
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})}, **streams)
 
 
