@@ -10,19 +10,16 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
 
-from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number, find_non_finite
+from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
 from sb3_tdc.tdc.compiled import numba_version
-from sb3_tdc.tdc.diagnostics import Diagnostics, NonFiniteError
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
+from sb3_tdc.tdc.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -30,7 +27,6 @@ from sb3_tdc.tdc.quantiles import (
     quantile_huber_gradient,
     quantile_huber_loss,
 )
-from sb3_tdc.tdc.transitions import check_first_observation, check_transition
 
 SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
@@ -42,7 +38,7 @@ DIAGNOSTICS_INTERVAL = 50
 FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
 
 
-class TDC(OffPolicyAlgorithm):
+class TDC(CheckedOffPolicyAlgorithm):
     """
     Twin Distributional Critics with a λ-lower confidence bound (TDC-λ), Osman et al.
 
@@ -98,6 +94,7 @@ class TDC(OffPolicyAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    schedules: ClassVar[tuple[str, ...]] = ("lam", "learning_rate", "qf_learning_rate")
     policy: TDCPolicy
     replay_buffer: ReplayBuffer
 
@@ -186,26 +183,18 @@ class TDC(OffPolicyAlgorithm):
     # ---------------------------------------------------------------- set-up
 
     def _check_arguments(self) -> None:
-        for name, maximum in (("tau", 1.0), ("gamma", 1.0)):
-            setattr(self, name, check_number(name, getattr(self, name), 0.0, maximum))
+        super()._check_arguments()
         for name in ("kappa", "target_policy_noise", "target_noise_clip"):
             setattr(self, name, check_number(name, getattr(self, name), 0.0))
-        minima = {"learning_starts": 0, "gradient_steps": -1}
-        for name in ("buffer_size", "batch_size", "n_steps", "policy_delay", *minima):
-            setattr(self, name, check_integer(name, getattr(self, name), minima.get(name, 1)))
+        self.policy_delay = check_integer("policy_delay", self.policy_delay, 1)
         for name in ("n_quantiles", "n_critics"):
             check_integer(f"policy_kwargs[{name!r}]", self.policy_kwargs.get(name, 1), 1)
         if self.target_entropy != "auto":
             check_number('target_entropy (if not "auto")', self.target_entropy)
         self._initial_ent_coef()
-        for name in ("lam", "learning_rate", "qf_learning_rate"):
-            value = self._scheduled(name, progress_remaining=1.0)
-            if getattr(self, name) is not None and not callable(getattr(self, name)):
-                setattr(self, name, value)
         saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
-        self._convert_train_freq()
 
     def _initial_ent_coef(self) -> float:
         coefficient = self.ent_coef
@@ -228,28 +217,9 @@ class TDC(OffPolicyAlgorithm):
         return self.ent_coef_optimizer is not None
 
     def _scheduled(self, name: str, progress_remaining: float | None = None) -> float:
-        """The current value of ``lam``, ``learning_rate`` or ``qf_learning_rate``, checked."""
-        value = getattr(self, name)
-        if value is None and name == "qf_learning_rate":
-            return self._scheduled("learning_rate", progress_remaining)
-        if name == "learning_rate" and progress_remaining is None:
-            value = self._current_lr_schedule()
-        if not callable(value):
-            return check_number(name, value, 0.0)
-        # A run overshoots its end by the rest of its last rollout; a schedule is for a progress between 1 and 0
-        progress = max(self._current_progress_remaining, 0.0) if progress_remaining is None else progress_remaining
-        return check_number(f"{name} (a schedule, at progress remaining {progress:.4g})", value(progress), 0.0)
-
-    def _current_lr_schedule(self) -> Schedule:
-        """SB3's ``lr_schedule``, made anew from ``learning_rate`` where that has been changed since."""
-        if self.learning_rate is not self._scheduled_learning_rate:
-            self._scheduled("learning_rate", progress_remaining=1.0)  # checks it
-            self._setup_lr_schedule()
-        return self.lr_schedule
-
-    def _setup_lr_schedule(self) -> None:
-        super()._setup_lr_schedule()
-        self._scheduled_learning_rate = self.learning_rate
+        if name == "qf_learning_rate" and self.qf_learning_rate is None:
+            name = "learning_rate"
+        return super()._scheduled(name, progress_remaining)
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -262,7 +232,6 @@ class TDC(OffPolicyAlgorithm):
         self._built_stochastic_actor = self.stochastic_actor
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
-        self._diagnostics = Diagnostics()
         self._setup_fused_update()
         self._setup_temperature()
 
@@ -481,10 +450,6 @@ class TDC(OffPolicyAlgorithm):
 
     # ---------------------------------------------------------------- logging
 
-    def diagnose(self, **values: th.Tensor) -> None:
-        """Take scalars of this update into the means of the log; nothing waits for the device."""
-        self._diagnostics.add(self._n_updates, self.num_timesteps, values)
-
     @property
     def diagnoses_critics(self) -> bool:
         """Whether this is an update at which the critics' diagnostics are taken."""
@@ -506,30 +471,6 @@ class TDC(OffPolicyAlgorithm):
             **{f"critic_{i + 1}_selected": (selected == i).float().mean() for i in range(mean.shape[1])},
         )
 
-    def _record_training(self) -> None:
-        """Leave in the logger what callbacks read there after ``train()``, as with every algorithm of SB3."""
-        logger = vars(self).get("_logger")
-        if logger is None:
-            return
-        for name in ("lam", "learning_rate", "qf_learning_rate"):
-            logger.record(f"train/{name}", self._scheduled(name))
-        logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._diagnostics.is_recorded = False
-        if self.device.type == "cpu":
-            self._diagnostics.record(logger)  # there is no device to wait for
-
-    @property
-    def logger(self) -> Logger:
-        """SB3's logger; what was measured in training is fetched from the device when somebody asks for the logger."""
-        if not self._diagnostics.is_recorded:
-            self._diagnostics.record(self._logger)
-        return self._logger
-
-    def dump_logs(self) -> None:
-        """Write log data; the means of the training begin anew."""
-        super().dump_logs()
-        self._diagnostics.restart()
-
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -545,27 +486,6 @@ class TDC(OffPolicyAlgorithm):
                 noise = noise.reshape(scaled_action.shape)
             scaled_action = np.clip(scaled_action + noise, -1, 1)
         return self.policy.unscale_action(scaled_action), scaled_action
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        try:
-            check_transition(self, buffer_action, new_obs, reward, dones, infos)
-        except NonFiniteError:
-            self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
-            raise
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        prepared = super()._setup_learn(*args, **kwargs)
-        check_first_observation(self)
-        return prepared
 
     def learn(
         self: SelfTDC,
@@ -613,25 +533,16 @@ class TDC(OffPolicyAlgorithm):
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
-        """
-        Save all the attributes of the object and the model parameters in a zip-file.
-
-        :param path: path to the file where the rl agent should be saved
-        :param exclude: name of parameters that should be excluded in addition to the default ones
-        :param include: name of parameters that might be excluded but should be included anyway
-        :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
-        """
         self._renew_temperature()
-        broken = find_non_finite(self.policy, self.policy.state_dict())
-        if self.stochastic_actor and not self.current_ent_coef().isfinite():
-            broken.append("ent_coef")
-        if broken:
-            raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
         super().save(path, exclude, include)
+
+    def _non_finite_weights(self) -> list[str]:
+        temperature_diverged = self.stochastic_actor and not self.current_ent_coef().isfinite()
+        return [*super()._non_finite_weights(), *(["ent_coef"] if temperature_diverged else [])]
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_diagnostics", "_fused_update", "_built_ent_coef", "_scheduled_learning_rate"]
+        derived = ["_obstacles", "_fused_update", "_built_ent_coef"]
         return [*super()._excluded_save_params(), *networks, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -329,7 +330,7 @@ def test_an_infinite_constant_is_saved_and_loaded(tmp_path, shared):
         with pytest.raises(NonFiniteError, match=rf"model.zip was not written: .*features_extractor.{name}"):
             model.save(tmp_path / "model.zip")
         unsafe = tmp_path / "unsafe.zip"
-        super(TDC, model).save(unsafe)
+        OffPolicyAlgorithm.save(model, unsafe)
         with pytest.raises(UnsafeFileError, match=rf"features_extractor.{name} has values that are not finite"):
             load_safely(unsafe, **given)
         model.policy.load_state_dict(good)
