@@ -41,13 +41,15 @@ from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.finite_guard import FiniteGuard, check_weights, divergence_named
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.interruption import StopOnSignal, ended_processes, ignore_signals
+from sb3_tdc.meow import MEOW
 from sb3_tdc.mujoco_messages import say_warnings_once
 from sb3_tdc.progress import ProgressCallback
 from sb3_tdc.run_folder import RunFolder, make_numbered, save
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safely, read_data
 from sb3_tdc.tdc import TDC, NonFiniteError
+from sb3_tdc.tdc.off_policy import CheckedOffPolicyAlgorithm
 
-ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "td3": TD3, "sac": SAC, "ddpg": DDPG}
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "meow": MEOW, "td3": TD3, "sac": SAC, "ddpg": DDPG}
 
 
 @dataclass
@@ -233,7 +235,7 @@ def train(experiment: Experiment) -> Outcome:
             if checkpoints is not None:
                 callbacks.insert(0, checkpoints)
                 _choose_checkpoint(experiment, checkpoints, model)
-            if not isinstance(model, TDC):
+            if not isinstance(model, CheckedOffPolicyAlgorithm):
                 callbacks.insert(0, FiniteGuard())
             callbacks.insert(0, BusyMachine(progress.say, _remedy(experiment)))
         except BaseException as error:

@@ -1,5 +1,5 @@
 """
-TDC in RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo tdc --env Hopper-v4``.
+TDC and MEOW in RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo tdc --env Hopper-v4``.
 
 The only module that imports ``rl_zoo3`` (extra ``[zoo]``).
 """
@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from sb3_tdc.hyperparams import hyperparams_file
+from sb3_tdc.meow import MEOW
 from sb3_tdc.tdc import TDC
 
 
 def register() -> None:
     """
-    Make ``tdc`` known to RL Zoo's training, enjoying and Optuna search.
+    Make ``tdc`` and ``meow`` known to RL Zoo's training, enjoying and Optuna search.
 
     :raises ImportError: if rl_zoo3 is missing, with the command that installs it
     """
@@ -25,9 +26,9 @@ def register() -> None:
         if error.name != "rl_zoo3":
             raise
         raise ImportError('RL Zoo is not installed: pip install "sb3-tdc[zoo]"') from error
-    ALGOS["tdc"] = TDC
-    hyperparams_opt.HYPERPARAMS_SAMPLER["tdc"] = sample_tdc_params
-    hyperparams_opt.HYPERPARAMS_CONVERTER["tdc"] = convert_tdc_params
+    ALGOS.update(tdc=TDC, meow=MEOW)
+    hyperparams_opt.HYPERPARAMS_SAMPLER.update(tdc=sample_tdc_params, meow=sample_meow_params)
+    hyperparams_opt.HYPERPARAMS_CONVERTER.update(tdc=convert_tdc_params, meow=convert_meow_params)
 
 
 def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -43,6 +44,33 @@ def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: 
     hyperparams["lam"] = trial.suggest_float("lam", 0.0, 1.0, step=0.1)
     hyperparams["policy_kwargs"]["n_quantiles"] = trial.suggest_categorical("n_quantiles", [16, 25, 64])
     return {"action_noise": None, **hyperparams}  # no noise sampled is none, not TDC's default
+
+
+def sample_meow_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Optuna's search space: RL Zoo's for TD3 without its noise, the temperature, and the upper limit of log σ.
+
+    :param trial: an ``optuna.Trial``
+    :return: keyword arguments of MEOW
+    """
+    from rl_zoo3.hyperparams_opt import sample_td3_params
+
+    hyperparams = sample_td3_params(trial, n_actions, n_envs, additional_args)
+    hyperparams.pop("action_noise", None)
+    hyperparams["policy_kwargs"]["log_std_max"] = trial.suggest_float("log_std_max", -0.3, 2.0)
+    return {**hyperparams, "ent_coef": trial.suggest_float("ent_coef", 0.01, 1.0, log=True)}
+
+
+def convert_meow_params(sampled: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled: the parameters of a finished Optuna trial
+    :return: hyperparameters as in a YAML file
+    """
+    from rl_zoo3.hyperparams_opt import convert_offpolicy_params
+
+    hyperparams = convert_offpolicy_params(sampled)
+    hyperparams["policy_kwargs"]["log_std_max"] = hyperparams.pop("log_std_max")
+    return {name: value for name, value in hyperparams.items() if not name.startswith("noise_")}
 
 
 def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
@@ -62,8 +90,8 @@ def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    RL Zoo's ``train`` or ``enjoy`` with TDC in it; ``train --algo tdc`` without ``-conf`` takes this package's
-    hyperparameters.
+    RL Zoo's ``train`` or ``enjoy`` with TDC and MEOW in it; ``train --algo tdc`` without ``-conf`` takes this package's
+    hyperparameters, and so does ``--algo meow``.
 
     :param argv: arguments, those of the process by default
     """
@@ -79,8 +107,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     relevant.add_argument("--algo")
     relevant.add_argument("-conf", "--conf-file")
     chosen, _ = relevant.parse_known_args(arguments)
-    if command == "train" and chosen.algo == "tdc" and chosen.conf_file is None:
-        arguments += ["-conf", str(hyperparams_file("tdc"))]
+    if command == "train" and chosen.algo in ("tdc", "meow") and chosen.conf_file is None:
+        arguments += ["-conf", str(hyperparams_file(chosen.algo))]
     sys.argv = [f"sb3_tdc.zoo {command}", *arguments]  # RL Zoo reads its arguments from there
     {"train": train, "enjoy": enjoy}[command]()
 

@@ -13,7 +13,7 @@ MAX_DIRECTORY = 2**20  # bytes of a zip's list of entries
 
 MODEL_ENTRIES = re.compile(
     r"data|_stable_baselines3_version|system_info\.txt|pytorch_variables\.pth|tensors\.pth|policy\.pth"
-    r"|(actor|critic)\.optimizer\.pth|ent_coef_optimizer\.pth"
+    r"|(actor|critic|policy)\.optimizer\.pth|ent_coef_optimizer\.pth"
 )
 
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
+from sb3_tdc.meow import MEOW
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
 from sb3_tdc.safe_load.checks import boolean, integer, is_plain, number, reading
 from sb3_tdc.safe_load.inert_pickle import Name, Rebuild, names_in, read_pickle
@@ -34,7 +35,7 @@ TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
     """The known policy classes, and the algorithm of each."""
-    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, TD3, SAC]
+    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, MEOW, TD3, SAC]
     with suppress(ImportError):  # contrib is an extra
         from sb3_contrib import TQC
 
@@ -89,8 +90,9 @@ def _train_freq(name: str, value: Any) -> Any:
 def _arguments(name: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value) or not is_plain(value):
         raise ValueError(f"{name} must be a mapping of names to finite numbers, texts and known classes")
-    if value.get("n_critics") is not None:
-        integer(1, MAX_CRITICS)("n_critics", value["n_critics"])
+    for counted in ("n_critics", "n_blocks"):  # so many networks are built before anything is compared
+        if value.get(counted) is not None:
+            integer(1, MAX_CRITICS)(counted, value[counted])
     return value
 
 
@@ -136,7 +138,7 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     "tau": number(maximum=1.0, above=0.0),
     "kappa": number(above=0.0),
     "_current_progress_remaining": number(-1.0, 1.0),
-    **dict.fromkeys(("target_policy_noise", "target_noise_clip"), number(0.0)),
+    **dict.fromkeys(("target_policy_noise", "target_noise_clip", "max_grad_norm"), number(0.0)),
     **dict.fromkeys(
         (
             *("use_sde", "use_sde_at_warmup", "optimize_memory_usage", "stochastic_actor", "_built_stochastic_actor"),

@@ -35,7 +35,7 @@ def load_safely(
     **kwargs: Any,
 ) -> OffPolicyAlgorithm:
     """
-    What ``Algorithm.load`` does for TDC, TD3, SAC, DDPG and TQC, without running anything that is in the file.
+    What ``Algorithm.load`` does for TDC, MEOW, TD3, SAC, DDPG and TQC, without running anything that is in the file.
 
     The model predicts and goes on learning as the saved one. It differs in this: ``tensorboard_log`` is never the
     file's, the last observation and the statistics of the last episodes are not kept (an environment is reset when
@@ -68,7 +68,7 @@ def load_safely(
         new_temperature = "ent_coef" in given and given["ent_coef"] != fields.get("ent_coef")
         fields.update({name: given[name] for name in (*kwargs, "ent_coef") if name in given})
         if saved_by is None:
-            raise UnsafeFileError("it has no policy_class of TDC, TD3, SAC, DDPG or TQC")
+            raise UnsafeFileError("it has no policy_class of TDC, MEOW, TD3, SAC, DDPG or TQC")
         if algorithm is not None and not issubclass(algorithm, saved_by):
             raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
         check_complete(fields, saved_by)

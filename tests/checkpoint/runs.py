@@ -25,7 +25,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_tdc import TDC
+from sb3_tdc import MEOW, TDC
 from sb3_tdc.checkpoint import Checkpoints, Restorable
 
 STEPS = 300
@@ -131,6 +131,14 @@ OTHERS = {
     ),
     "TD3": Case("Hopper-v4", TD3),
     "SAC": Case("Hopper-v4", SAC),
+    "MEOW": Case("Hopper-v4", MEOW),
+    "MEOW, n-step, schedule": Case(
+        "Hopper-v4",
+        MEOW,
+        n_envs=2,
+        wrap=VecNormalize,
+        kwargs={"n_steps": 3, "learning_rate": LinearSchedule(1e-3, 0, 1), "policy_kwargs": {"dropout": 0.3}},
+    ),
     "SAC, gSDE": Case("Hopper-v4", SAC, n_envs=2, kwargs={"use_sde": True, "sde_sample_freq": 4}),
     "TQC, gSDE": Case("Hopper-v4", TQC, kwargs={"use_sde": True}),
     "Ant-v5": Case("Ant-v5"),

@@ -11,6 +11,7 @@ from matplotlib import figure
 from experiments import figures, report, tables, test_returns
 from experiments.results import Run, find_runs, group_runs
 from sb3_tdc import train
+from sb3_tdc.experiment import ALGORITHMS
 from tests.experiments.test_results import make_run
 
 
@@ -55,7 +56,7 @@ def test_published_returns_are_those_of_the_sources(tmp_path):
     assert table.loc["TDC: this report", ["Hopper", "Ant", "Steps", "Seeds"]].tolist() == ["100", "–", "1,000", "1"]
     tianshou = table.loc["SAC: Tianshou's examples/mujoco"]
     assert (tianshou["HalfCheetah"], tianshou["Steps"], tianshou["Seeds"]) == ("12,139 ± 1,049", "1M", "10")
-    assert table.loc["MEOW: MEOW's repository", "Steps"] == "1.5M / 1.5M / 4M / 4M / 5M"
+    assert table.loc["MEOW: MEOW's paper", "Steps"] == "1.5M / 1.5M / 4M / 4M / 5M"
     entries = yaml.safe_load(tables._PUBLISHED.read_text())
     assert all({"source", "how", "version", "seeds", "steps", "returns"} <= set(entry) for entry in entries)
 
@@ -152,7 +153,8 @@ def test_scores_over_tasks_need_two_seeds_of_everything(tmp_path):
     assert [scores.tolist() for scores in found["SAC"]] == [[0, 0.5], [0, 0.5]]
 
 
-def test_what_is_missing_is_said(tmp_path):
+def test_what_is_missing_is_said(tmp_path, monkeypatch):
+    monkeypatch.delitem(ALGORITHMS, "meow")
     make_run(tmp_path, seed=1)
     make_run(tmp_path, seed=2, steps=400)
     broken = make_run(tmp_path, seed=3)
