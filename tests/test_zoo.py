@@ -2,7 +2,7 @@
 
 import pytest
 
-from sb3_tdc import TDC, zoo
+from sb3_tdc import MEOW, TDC, zoo
 from sb3_tdc import train as our_train
 
 rl_zoo3 = pytest.importorskip("rl_zoo3")
@@ -17,6 +17,29 @@ def test_training_and_enjoying(tmp_path, capsys):
     enjoy = ["enjoy", "--algo", "tdc", "--env", "Hopper-v4", "-f", str(tmp_path), "--no-render", "-n", "100"]
     zoo.main(enjoy)
     assert "Mean reward" in capsys.readouterr().out
+
+
+def test_training_meow_with_its_own_hyperparameters(tmp_path):
+    small = ["-params", "policy_kwargs:dict(net_arch=[8, 8], shift_arch=[8], log_std_max=-0.3)", "buffer_size:1000"]
+    small += ["learning_starts:100"]
+    zoo.main(
+        ["train", "--algo", "meow", "--env", "Walker2d-v4", "-n", "120", "-f", str(tmp_path), "--seed", "1", *small]
+    )
+    model = MEOW.load(tmp_path / "meow" / "Walker2d-v4_1" / "Walker2d-v4.zip")
+    assert (model.ent_coef, model.learning_rate(1.0), model._n_updates) == (0.1, 1e-3, 20)  # from hyperparams/meow.yml
+
+
+@pytest.mark.parametrize("network", ["small", "big"])
+def test_the_search_space_of_meow_makes_models(network):
+    import optuna
+
+    fixed = {"one_minus_gamma": 0.01, "batch_size_pow": 5, "learning_rate": 1e-3, "train_freq": 2, "tau": 0.01}
+    fixed |= {"noise_type": "normal", "noise_std": 0.1, "net_arch": network, "log_std_max": 1.0, "ent_coef": 0.2}
+    trial = optuna.trial.FixedTrial(fixed)
+    sampled = zoo.sample_meow_params(trial, 1, 1, {"using_her_replay_buffer": False})
+    model = MEOW("MlpPolicy", "Pendulum-v1", buffer_size=10, **sampled)
+    assert (model.ent_coef, model.network.flow.log_std_max, model.action_noise) == (0.2, 1.0, None)
+    assert zoo.convert_meow_params(trial.params) == sampled
 
 
 def test_zoo_enjoys_a_run_of_train_py(tmp_path, capsys):

@@ -3,8 +3,8 @@ The conditional normalising flow of MEOW: a Gaussian that depends on the state, 
 
 The couplings are written out. zuko, the maintained library of flows for PyTorch, has additive ones
 (``GeneralCouplingTransform`` with ``AdditiveTransform``), but its translation networks have no dropout, normalise after
-the activation and without learnable scales, and the mask of a single action leaves nothing to shift. Its inverse with the
-backward pass took about twice the time of this one, on one thread (``python -m benchmarks.flows``).
+the activation and without learnable scales, and the mask of a single action leaves nothing to shift. Its inverse and
+backward pass took about twice the time of these, on one thread (``python -m benchmarks.flows``).
 """
 
 import math
