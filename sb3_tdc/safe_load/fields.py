@@ -266,6 +266,7 @@ REQUIRED_OF: dict[str, tuple[str, ...]] = {
     "TD3": _OF_TD3,
     "SAC": _OF_SAC,
     "TQC": (*_OF_SAC, "top_quantiles_to_drop_per_net"),
+    "MEOW": ("ent_coef",),
     "TDC": (*_OF_TD3, "lam", "kappa", "qf_learning_rate", "stochastic_actor", "ent_coef", "target_entropy"),
 }
 
