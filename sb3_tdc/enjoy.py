@@ -23,6 +23,7 @@ from sb3_tdc.arguments import (
     check_writable,
     import_packages,
 )
+from sb3_tdc.checked_envs import EnvironmentFaultError
 from sb3_tdc.experiment import ALGORITHMS, SETUP_ERRORS, check_env_id, load_model, make_envs
 from sb3_tdc.explain import play_episodes, steps_until_negligible, write_explanation
 from sb3_tdc.hyperparams import Hyperparams, parse
@@ -278,6 +279,8 @@ def _make_env(trained: Trained, args: argparse.Namespace, env_kwargs: dict[str, 
             training=False,
             trust=args.trust,
         )
+    except EnvironmentFaultError as error:
+        raise ValueError(str(error)) from error
     except SETUP_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{trained.env_id} cannot be made: {reason}") from error
@@ -329,7 +332,7 @@ def _run(args: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: arguments, those of the process by default
-    :return: 0
+    :return: 0, 1 if the environment failed
     """
     parser = make_parser()
     args = parser.parse_args(argv)
@@ -337,6 +340,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _run(args)
     except (ValueError, ImportError, DependencyNotInstalled) as error:
         parser.fail(error)
+    except EnvironmentFaultError as error:
+        print(f"The environment failed: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,13 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, Ornst
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
-    SubprocVecEnv,
     VecEnv,
     VecFrameStack,
     VecNormalize,
 )
 
 from sb3_tdc.busy_machine import BusyMachine
+from sb3_tdc.checked_envs import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
 from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, LockedError, NotRestoredError, Restorable, stored_steps
 from sb3_tdc.critic_evaluation import CriticEvaluation
 from sb3_tdc.finite_guard import FiniteGuard, check_weights, divergence_named
@@ -170,10 +170,14 @@ def make_envs(
         if vec_env == "subproc":
             ignore_signals()
         say_warnings_once()
-        env = spec.make(**kwargs)
-        for wrapper in hyperparams.env_wrapper:
-            env = wrapper(env)
-        return env
+        try:
+            env = spec.make(**kwargs)
+            for wrapper in hyperparams.env_wrapper:
+                env = wrapper(env)
+            return CheckedEnv(env)
+        except Exception as error:
+            reason = describe_exception(error)
+            raise EnvironmentFaultError(f"{env_id} cannot be made: {reason}", traceback.format_exc()) from error
 
     env = make_vec_env(
         make_env,
@@ -182,7 +186,7 @@ def make_envs(
         monitor_dir=str(monitor_folder) if monitor_folder else None,
         monitor_kwargs=hyperparams.monitor_kwargs,
         env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
-        vec_env_cls=SubprocVecEnv if vec_env == "subproc" else DummyVecEnv,
+        vec_env_cls=CheckedSubprocVecEnv if vec_env == "subproc" else DummyVecEnv,
         wrapper_class=Restorable if vec_env == "subproc" else None,
     )
     for wrapper in hyperparams.vec_env_wrapper:
@@ -266,23 +270,15 @@ def _learn(experiment: Experiment, model: OffPolicyAlgorithm, callbacks: list[Ba
     except (NonFiniteError, NotRestoredError, LockedError):
         raise
     except Exception as error:
-        reason = _describe_death(model) or f"{type(error).__name__}: {' '.join(str(error).split())}"
+        if isinstance(error, EnvironmentFaultError):
+            reason, details = str(error), error.details
+        else:
+            reason, details = describe_exception(error), ""
         if model.num_timesteps == 0 and not experiment.resume:
             shutil.rmtree(experiment.folder.path)
             raise SetupError(f"{experiment.env_id} failed before the first step: {reason}") from error
-        experiment.folder.write_error(traceback.format_exc())
+        experiment.folder.write_error(details or traceback.format_exc())
         raise TrainingError(f"Training failed at step {model.num_timesteps:,}: {reason}") from error
-
-
-def _describe_death(model: OffPolicyAlgorithm) -> str:
-    """Return which process of an environment has died, if any: all that is left of it here is a closed pipe."""
-    processes = getattr(model.env.unwrapped, "processes", []) if model.env is not None else []
-    for i, process in enumerate(processes):
-        process.join(timeout=0.5)
-        if process.exitcode is not None:
-            cause = f"by signal {-process.exitcode}" if process.exitcode < 0 else "its own message is above"
-            return f"the process of environment {i} has died ({cause})"
-    return ""
 
 
 def _remedy(experiment: Experiment) -> str:
@@ -497,9 +493,7 @@ def _closing(env: VecEnv) -> Iterator[VecEnv]:
             process.kill()
         raise
     finally:
-        # A process that died on its own cannot be told to close
-        with suppress(BrokenPipeError, ConnectionResetError, EOFError):
-            env.close()
+        env.close()
 
 
 class _SaveBest(BaseCallback):
