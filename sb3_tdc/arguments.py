@@ -16,6 +16,14 @@ from sb3_tdc.hyperparams import suggest
 MAX_SEED = 2**31 - 1
 
 
+class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Show defaults, where they are values: of a flag that is not given there is none to show."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        says_nothing = action.default is None or isinstance(action.default, bool) or action.default in ([], {}, "")
+        return action.help if says_nothing else super()._get_help_string(action)
+
+
 class Parser(argparse.ArgumentParser):
     """
     An argument parser that names the nearest flag for a misspelt one.
@@ -25,9 +33,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, description: str, zoo_flags: Mapping[str, str] | None = None):
         self.zoo_flags = zoo_flags or {}
-        super().__init__(
-            description=description, allow_abbrev=False, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-        )
+        super().__init__(description=description, allow_abbrev=False, formatter_class=_HelpFormatter)
 
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None

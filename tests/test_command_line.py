@@ -548,3 +548,11 @@ for _ in range(3):
     assert ended.stderr.count("The simulation is unstable") == 1
     assert "settotalmass" not in ended.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("make_parser", [train.make_parser, enjoy.make_parser])
+def test_help_shows_defaults_that_are_values_alone(make_parser):
+    text = make_parser().format_help()
+    shown = {" ".join(default.split()) for default in re.findall(r"\(default:\s+(.*?)\)", text, re.DOTALL)}
+    assert {"tdc", "logs", "HalfCheetah-v4"} <= shown
+    assert not shown & {"None", "True", "False", "[]", "{}"}
