@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_tdc.advb.policies import AdvisedPolicy
 from sb3_tdc.arguments import (
     MAX_SEED,
     Parser,
@@ -63,7 +64,12 @@ def make_parser() -> Parser:
     add("--record", type=Path, metavar="FILE.mp4", help="write a video")
     add("--explain", action="store_true", help="draw what the critics predict against what follows, beside the model")
     add("--no-render", action="store_true", help="no picture, only returns")
-    add("--stochastic", action="store_true", help="sampled instead of mean actions (SAC; TDC always takes the mean)")
+    add(
+        "--stochastic",
+        action="store_true",
+        help="sampled instead of mean actions (SAC, MEOW; TDC always takes the mean)",
+    )
+    add("--board", action="store_true", help="actions of the advisory board (AdvB) instead of those of the actor alone")
     add("--seed", type=int, default=0, help="seed of the environment")
     add(
         "--trust",
@@ -266,6 +272,23 @@ def _check_outputs(args: argparse.Namespace, trained: Trained) -> None:
         check_writable("--record", args.record)
 
 
+def _choose_who_acts(model: BaseAlgorithm, args: argparse.Namespace) -> AbstractContextManager[None]:
+    """
+    :return: a context in which a board acts if it was asked for, and else the actor alone
+    :raises ValueError: if there is no board, or it has no members
+    """
+    if not isinstance(model.policy, AdvisedPolicy):
+        if args.board:
+            raise ValueError("--board needs a model of advb_td3 or advb_sac: this one has no board")
+        return nullcontext()
+    if args.board and (args.stochastic or len(model.policy.board) == 0):
+        why = (
+            "takes mean actions: leave out --stochastic" if args.stochastic else "needs members: this one has none yet"
+        )
+        raise ValueError(f"--board {why}")
+    return nullcontext() if args.board else model.policy.actor_alone()
+
+
 def _make_env(trained: Trained, args: argparse.Namespace, env_kwargs: dict[str, Any]) -> VecEnv:
     """:raises ValueError: with what the environment or a wrapper raises"""
     try:
@@ -310,6 +333,7 @@ def _run(args: argparse.Namespace) -> int:
         for unwrapped in env.get_attr("unwrapped"):
             follow_agent(unwrapped)
         model = load_model(trained.path, trained.algo, env, args.trust, device=args.device, buffer_size=1)
+        stack.enter_context(_choose_who_acts(model, args))
         env.seed(args.seed)  # loading has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")
         if args.explain:

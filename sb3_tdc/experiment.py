@@ -34,6 +34,8 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, BoardCallback
+from sb3_tdc.advb.algorithms import Advised
 from sb3_tdc.busy_machine import BusyMachine
 from sb3_tdc.checked_envs import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
 from sb3_tdc.checkpoint import DEFAULT_FREQ, Checkpoints, LockedError, NotRestoredError, Restorable, stored_steps
@@ -49,7 +51,15 @@ from sb3_tdc.safe_load import load_normalization, load_replay_buffer, load_safel
 from sb3_tdc.tdc import TDC, NonFiniteError
 from sb3_tdc.tdc.off_policy import CheckedOffPolicyAlgorithm
 
-ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"tdc": TDC, "meow": MEOW, "td3": TD3, "sac": SAC, "ddpg": DDPG}
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
+    "tdc": TDC,
+    "meow": MEOW,
+    "td3": TD3,
+    "sac": SAC,
+    "ddpg": DDPG,
+    "advb_td3": AdvBTD3,
+    "advb_sac": AdvBSAC,
+}
 
 
 @dataclass
@@ -233,9 +243,13 @@ def train(experiment: Experiment) -> Outcome:
             if experiment.eval_freq > 0:
                 eval_env = stack.enter_context(_closing(_make_eval_envs(experiment)))
                 eval_env = model._wrap_env(eval_env, verbose=0, monitor_wrapper=False)
+            board = []
+            if isinstance(model, Advised):
+                test_env = stack.enter_context(_closing(_make_test_env(experiment)))
+                board = [BoardCallback(model._wrap_env(test_env, verbose=0, monitor_wrapper=False))]
             stop = StopOnSignal(checkpoints)
             progress = ProgressCallback(experiment.progress_bar, experiment.verbose)
-            callbacks = [*_make_callbacks(experiment, eval_env, progress, stop), progress, stop]
+            callbacks = [*board, *_make_callbacks(experiment, eval_env, progress, stop), progress, stop]
             if checkpoints is not None:
                 callbacks.insert(0, checkpoints)
                 _choose_checkpoint(experiment, checkpoints, model)
@@ -350,6 +364,18 @@ def _make_eval_envs(experiment: Experiment) -> VecEnv:
         experiment.n_eval_envs,
         experiment.eval_env_kwargs or experiment.env_kwargs,
         experiment.vec_env,
+        training=False,
+    )
+
+
+def _make_test_env(experiment: Experiment) -> VecEnv:
+    """The environment of the test episodes of a board."""
+    return make_envs(
+        experiment.env_id,
+        experiment.hyperparams,
+        experiment.seed + 2_000,  # other initial states than in training and in evaluations
+        1,
+        experiment.env_kwargs,
         training=False,
     )
 

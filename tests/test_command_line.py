@@ -100,7 +100,7 @@ def test_the_seed_decides_everything(tmp_path):
     assert any(not th.equal(a[k], c[k]) for k in a)
 
 
-@pytest.mark.parametrize("algo", ["meow", "td3", "sac", "ddpg"])
+@pytest.mark.parametrize("algo", ["meow", "td3", "sac", "ddpg", "advb_td3"])
 def test_the_baselines_run_through_the_same_pipeline(tmp_path, algo, capsys):
     assert run_train(tmp_path, algo=algo, small=SMALL_ANY) == 0
     assert run_enjoy("--algo", algo, "--env", "Hopper-v4", "-f", tmp_path) == 0
@@ -354,7 +354,10 @@ def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
     ("args", "message"),
     [
         (["--env", "Walker3d-v4"], "There is no environment 'Walker3d-v4'; did you mean Walker2d-v4"),
-        (["--algo", "tdd"], "unknown algorithm 'tdd'; did you mean 'tdc'?; known: tdc, meow, td3, sac, ddpg"),
+        (
+            ["--algo", "tdd"],
+            "unknown algorithm 'tdd'; did you mean 'tdc'?; known: tdc, meow, td3, sac, ddpg, advb_td3, advb_sac",
+        ),
         (["--evalfreq", "3"], "unknown argument '--evalfreq'; did you mean '--eval-freq'?"),
         (["-n", "many"], "argument -n/--n-timesteps: invalid int value: 'many'"),
         (["-params", "lam"], "must be key:value, got 'lam'"),

@@ -17,6 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_tdc.advb import AdvBSAC, AdvBTD3
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
 from sb3_tdc.meow import MEOW
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
@@ -35,7 +36,7 @@ TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
     """The known policy classes, and the algorithm of each."""
-    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, MEOW, TD3, SAC]
+    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, MEOW, AdvBTD3, AdvBSAC, TD3, SAC]
     with suppress(ImportError):  # contrib is an extra
         from sb3_contrib import TQC
 
@@ -90,7 +91,7 @@ def _train_freq(name: str, value: Any) -> Any:
 def _arguments(name: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value) or not is_plain(value):
         raise ValueError(f"{name} must be a mapping of names to finite numbers, texts and known classes")
-    for counted in ("n_critics", "n_blocks"):  # so many networks are built before anything is compared
+    for counted in ("n_critics", "n_blocks", "n_members"):  # so many networks are built before anything is compared
         if value.get(counted) is not None:
             integer(1, MAX_CRITICS)(counted, value[counted])
     return value
@@ -130,7 +131,7 @@ _FIELDS: dict[str, Callable[[str, Any], Any]] = {
     **dict.fromkeys(
         (
             *("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"),
-            *("learning_starts", "_stats_window_size", "top_quantiles_to_drop_per_net"),
+            *("learning_starts", "formation_period", "_stats_window_size", "top_quantiles_to_drop_per_net"),
         ),
         integer(0),
     ),

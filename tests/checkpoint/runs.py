@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_tdc import MEOW, TDC
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, BoardCallback
 from sb3_tdc.checkpoint import Checkpoints, Restorable
 
 STEPS = 300
@@ -139,6 +140,8 @@ OTHERS = {
         wrap=VecNormalize,
         kwargs={"n_steps": 3, "learning_rate": LinearSchedule(1e-3, 0, 1), "policy_kwargs": {"dropout": 0.3}},
     ),
+    "AdvB-TD3": Case("Hopper-v4", AdvBTD3, kwargs={"formation_period": 3}),
+    "AdvB-SAC": Case("Hopper-v4", AdvBSAC, n_envs=2, wrap=VecNormalize),
     "SAC, gSDE": Case("Hopper-v4", SAC, n_envs=2, kwargs={"use_sde": True, "sde_sample_freq": 4}),
     "TQC, gSDE": Case("Hopper-v4", TQC, kwargs={"use_sde": True}),
     "Ant-v5": Case("Ant-v5"),
@@ -249,7 +252,11 @@ def make_callbacks(case: Case, folder: Path, stop_at: int | None) -> list[BaseCa
         verbose=0,
         warn=False,
     )
-    return [Checkpoints(folder / "checkpoints", freq=40, verbose=0), Trace(), evaluation, StopAt(stop_at)]
+    board = []
+    if case.algorithm in (AdvBTD3, AdvBSAC):
+        test_env = _wrap(case, make_vec_env(case.env, 1, seed=6, env_kwargs=case.env_kwargs))
+        board = [BoardCallback(test_env)]
+    return [Checkpoints(folder / "checkpoints", freq=40, verbose=0), Trace(), *board, evaluation, StopAt(stop_at)]
 
 
 def run(case: Case, folder: Path, stop_at: int | None = None) -> dict[str, Any]:

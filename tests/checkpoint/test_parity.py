@@ -10,7 +10,15 @@ import pytest
 from tests.checkpoint.runs import CASES, CROSS, OTHERS
 
 ROOT = Path(__file__).parents[2]
-SLOW = [*CROSS, "readable update", "ring overwritten, two environments", "SAC", "TQC, gSDE", "HER with infos"]
+SLOW = [
+    *CROSS,
+    "readable update",
+    "ring overwritten, two environments",
+    "SAC",
+    "TQC, gSDE",
+    "HER with infos",
+    "AdvB-SAC",
+]
 QUICK = ["Ant-v4-dummy1-plain", "Humanoid-v4-dummy2-gaussian", "Hopper-v4-subproc2-plain"]
 QUICK += [name for name in OTHERS if name not in SLOW]
 

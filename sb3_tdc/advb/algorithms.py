@@ -1,0 +1,72 @@
+"""SB3's TD3 and SAC with an advisory board. No algorithm changes: only who decides about an action."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_tdc.advb import policies
+from sb3_tdc.tdc.checks import check_integer
+
+
+class Advised(OffPolicyAlgorithm):
+    """
+    An off-policy algorithm whose policy has a board. :class:`~sb3_tdc.advb.BoardCallback` fills it during training.
+
+    :param formation_period: episodes before the board also acts in training; with SAC, which then explores by
+        ``action_noise`` alone
+    :param args: those of the algorithm
+    :param kwargs: those of the algorithm; ``policy_kwargs`` may hold ``n_members`` (10)
+    """
+
+    def __init__(self, *args: Any, formation_period: int = 10_000, **kwargs: Any):
+        self.formation_period = formation_period
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        self.formation_period = check_integer("formation_period", self.formation_period, 0)
+        check_integer("policy_kwargs['n_members']", self.policy_kwargs.get("n_members", 10), 1)
+        super()._setup_model()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        policy: Any = self.policy
+        policy.board_explores = self._episode_num >= self.formation_period
+        try:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        finally:
+            policy.board_explores = False
+
+
+class AdvBTD3(Advised, TD3):
+    """
+    TD3 with a cooperative advisory board (AdvB-TD3, Osman et al.).
+
+    :param args: those of SB3's TD3
+    :param kwargs: those of SB3's TD3; ``formation_period``: episodes before the board also acts in training
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.TD3MlpPolicy,
+        "CnnPolicy": policies.TD3CnnPolicy,
+        "MultiInputPolicy": policies.TD3MultiInputPolicy,
+    }
+
+
+class AdvBSAC(Advised, SAC):
+    """
+    SAC with the board of AdvB-TD3: nothing public describes AdvB-SAC. Its members advise their mean actions.
+
+    :param args: those of SB3's SAC
+    :param kwargs: those of SB3's SAC; ``formation_period``: episodes before the board also acts in training
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.SACMlpPolicy,
+        "CnnPolicy": policies.SACCnnPolicy,
+        "MultiInputPolicy": policies.SACMultiInputPolicy,
+    }

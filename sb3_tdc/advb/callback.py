@@ -1,0 +1,50 @@
+"""Test episodes that decide about the seats of a board."""
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+
+from sb3_tdc.advb.policies import AdvisedPolicy
+
+
+class BoardCallback(BaseCallback):
+    """
+    Play one deterministic test episode of the actor alone after every training episode, and propose it to the board.
+
+    Test episodes cost steps that ``num_timesteps`` does not count: they are logged as ``board/test_steps``.
+
+    :param test_env: one environment of its own, wrapped as that of the training
+    :param verbose: 1 prints every new member
+    """
+
+    def __init__(self, test_env: VecEnv, verbose: int = 0):
+        super().__init__(verbose)
+        if test_env.num_envs != 1:
+            raise ValueError(f"test_env must be one environment, got {test_env.num_envs}")
+        self.test_env = test_env
+        self.test_steps = 0
+
+    def _on_step(self) -> bool:
+        for _ in range(int(np.sum(self.locals["dones"]))):
+            self._test_actor()
+        return True
+
+    def _test_actor(self) -> None:
+        policy = self.model.policy
+        assert isinstance(policy, AdvisedPolicy)
+        if isinstance(self.test_env, VecNormalize):
+            sync_envs_normalization(self.training_env, self.test_env)
+        with policy.actor_alone():
+            returns, lengths = evaluate_policy(
+                self.model, self.test_env, n_eval_episodes=1, return_episode_rewards=True, warn=False
+            )
+        assert isinstance(returns, list) and isinstance(lengths, list)  # noqa: PT018
+        self.test_steps += lengths[0]
+        seat = policy.board.propose(policy.actor, returns[0])  # type: ignore[arg-type]
+        if self.verbose > 0 and seat is not None:
+            print(f"The actor of step {self.num_timesteps:,} takes seat {seat + 1} with a return of {returns[0]:.1f}")
+        self.logger.record("board/test_return", returns[0])
+        self.logger.record("board/test_steps", self.test_steps)
+        self.logger.record("board/members", len(policy.board))
+        self.logger.record("board/best_return", float(policy.board.returns[0]))

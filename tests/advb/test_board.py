@@ -1,0 +1,236 @@
+"""Who sits on a board, what it does, and that it comes back with a model."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_tdc import load_safely
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, BoardCallback
+from tests.tdc.test_update import OBS, TwoActions
+
+ALGORITHMS = pytest.mark.parametrize("algorithm", [AdvBTD3, AdvBSAC])
+
+
+def make(algorithm=AdvBTD3, n_members=3, env=None, **kwargs):
+    policy_kwargs = {"net_arch": [8, 8], "n_members": n_members}
+    settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu", **kwargs}
+    return algorithm("MlpPolicy", env or TwoActions(), policy_kwargs=policy_kwargs, **settings)
+
+
+def perturb(network, seed):
+    generator = th.Generator().manual_seed(seed)
+    with th.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.5 * th.randn(parameter.shape, generator=generator))
+
+
+def fill(model, returns):
+    """Propose a new actor for every return; the weights that each had, by return."""
+    actors = {}
+    for seed, test_return in enumerate(returns):
+        perturb(model.policy.actor, seed)
+        actors[test_return] = {name: tensor.clone() for name, tensor in model.policy.actor.state_dict().items()}
+        model.policy.board.propose(model.policy.actor, test_return)
+    return actors
+
+
+def observations(n=50):
+    return np.random.default_rng(0).normal(size=(n, OBS)).astype(np.float32)
+
+
+@ALGORITHMS
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        ([5.0], [5.0]),
+        ([1.0, 2.0], [2.0, 1.0]),
+        ([2.0, 1.0, 3.0, -4.0], [3.0, 2.0, 1.0]),  # −4 finds no seat
+        ([1.0, 2.0, 3.0, 2.5], [3.0, 2.5, 2.0]),  # 1 leaves
+        ([1.0, 2.0, 3.0, 9.0, 8.0], [9.0, 8.0, 3.0]),
+    ],
+)
+def test_members_are_ordered_by_their_returns(algorithm, returns, expected):
+    model = make(algorithm)
+    actors = fill(model, returns)
+    board = model.policy.board
+    assert board.returns[: len(board)].tolist() == expected
+    for member, test_return in zip(board.members, expected, strict=False):
+        assert all(th.equal(tensor, actors[test_return][name]) for name, tensor in member.state_dict().items())
+
+
+def test_an_equal_return_comes_after_those_that_were_there():
+    board = make().policy.board
+    actor = make().policy.actor
+    assert [board.propose(actor, value) for value in (1.0, 1.0, 1.0, 1.0)] == [0, 1, 2, None]
+
+
+@ALGORITHMS
+def test_the_cooperative_action_is_the_best_by_brute_force(algorithm):
+    model = make(algorithm)
+    fill(model, [1.0, 3.0, 2.0])
+    policy, obs = model.policy, th.tensor(observations())
+    perturb(policy.critic, 7)
+    with th.no_grad():
+        chosen = policy._predict(obs, deterministic=True)
+        members = set()
+        for i in range(len(obs)):
+            advice = [member._predict(obs[i : i + 1], deterministic=True) for member in policy.board.members]
+            values = [min(float(q) for q in policy.critic(obs[i : i + 1], action)) for action in advice]
+            members.add(int(np.argmax(values)))
+            assert th.allclose(chosen[i], advice[int(np.argmax(values))][0], atol=1e-6)
+    assert len(members) > 1  # not always the same
+
+
+@ALGORITHMS
+def test_a_board_of_one_is_the_actor_that_it_took(algorithm):
+    model = make(algorithm, n_members=1)
+    fill(model, [1.0])
+    with model.policy.actor_alone():
+        alone, _ = model.predict(observations(), deterministic=True)
+    assert np.allclose(model.predict(observations(), deterministic=True)[0], alone, atol=1e-6)
+    perturb(model.policy.actor, 5)  # a snapshot does not learn
+    assert np.allclose(model.predict(observations(), deterministic=True)[0], alone, atol=1e-6)
+
+
+@ALGORITHMS
+def test_without_members_the_actor_acts(algorithm):
+    model = make(algorithm)
+    plain = algorithm.__mro__[2]  # SB3's
+    expected = plain.policy_aliases["MlpPolicy"]._predict(model.policy, th.tensor(observations()), deterministic=True)
+    with th.no_grad():
+        assert np.allclose(model.policy._predict(th.tensor(observations()), deterministic=True), expected.detach())
+    with pytest.raises(ValueError, match="no members yet"):
+        model.policy.board.cooperative_actions(th.tensor(observations()), model.policy.score)
+
+
+def test_critics_and_members_are_in_evaluation_mode_when_the_board_acts(monkeypatch):
+    model = make()
+    fill(model, [1.0, 2.0])
+    modes, score = [], model.policy.score
+
+    def recording(obs, actions):
+        modes.append(model.policy.critic.training)
+        return score(obs, actions)
+
+    monkeypatch.setattr(model.policy, "score", recording)
+    model.policy.set_training_mode(True)
+    model.predict(observations(), deterministic=True)
+    assert modes == [False, False]
+    assert not any(module.training for module in model.policy.board.members.modules())
+
+
+class Watch(BaseCallback):
+    """Counts the episodes of a training, and notes for every episode whether the board was asked for an action."""
+
+    def __init__(self, monkeypatch):
+        super().__init__()
+        self.monkeypatch, self.asked, self.current = monkeypatch, [], []
+
+    def _on_training_start(self):
+        score = self.model.policy.score
+
+        def recording(*args):
+            if not self.model.policy.actor_decides_alone:
+                self.current.append(True)
+            return score(*args)
+
+        self.monkeypatch.setattr(self.model.policy, "score", recording)
+
+    def _on_step(self):
+        if self.locals["dones"][0]:
+            self.asked.append(bool(self.current))
+            self.current = []
+        return True
+
+
+@ALGORITHMS
+@pytest.mark.parametrize("formation_period", [2, 10_000])
+def test_the_board_acts_in_training_from_the_formation_period_on(monkeypatch, algorithm, formation_period):
+    model = make(algorithm, formation_period=formation_period)
+    watch, test_env = Watch(monkeypatch), make_vec_env(TwoActions, 1)
+    model.learn(40, callback=[BoardCallback(test_env), watch])
+    assert len(watch.asked) >= 6
+    assert watch.asked == [i >= formation_period for i in range(len(watch.asked))]
+
+
+def test_every_training_episode_is_followed_by_a_test_episode_of_the_actor_alone(tmp_path):
+    model = make(env=make_vec_env(TwoActions, 2, seed=1), n_members=50)
+    model.set_logger(configure(str(tmp_path), []))
+    callback = BoardCallback(make_vec_env(TwoActions, 1, seed=2))
+    model.learn(80, callback=callback, log_interval=None)
+    assert model._episode_num > 10
+    assert len(model.policy.board) == model._episode_num
+    assert 5 * model._episode_num <= callback.test_steps <= 7 * model._episode_num  # episodes are 5 or 7 steps long
+    assert callback.test_env.envs[0].unwrapped.episode >= model._episode_num
+    log = model.logger.name_to_value
+    assert (log["board/test_steps"], log["board/members"]) == (callback.test_steps, model._episode_num)
+    assert log["board/best_return"] == model.policy.board.returns[: len(model.policy.board)].max()
+
+
+def test_test_episodes_use_the_statistics_of_the_training():
+    env, test_env = (VecNormalize(make_vec_env(TwoActions, 1, seed=seed)) for seed in (1, 2))
+    model = make(env=env)
+    model.learn(40, callback=BoardCallback(test_env))
+    assert test_env.obs_rms.count > 20  # it would be 10⁻⁴ of its own, which does not learn
+    with pytest.raises(ValueError, match="one environment, got 2"):
+        BoardCallback(make_vec_env(TwoActions, 2))
+
+
+@ALGORITHMS
+def test_a_board_is_saved_and_opened_with_its_model(tmp_path, algorithm):
+    model = make(algorithm, formation_period=7)
+    fill(model, [1.0, 3.0])
+    model.learn(20)
+    model.save(tmp_path / "model.zip")
+    expected, _ = model.predict(observations(), deterministic=True)
+    for loaded in (algorithm.load(tmp_path / "model.zip"), load_safely(tmp_path / "model.zip", device="cpu")):
+        assert type(loaded) is algorithm
+        assert loaded.formation_period == 7
+        assert loaded.policy.board.returns[:2].tolist() == [3.0, 1.0]
+        assert len(loaded.policy.board) == 2
+        assert np.array_equal(loaded.predict(observations(), deterministic=True)[0], expected)
+
+
+@ALGORITHMS
+def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
+    """The same weights as SB3's algorithm that begins with them, with a board that is filled beside it."""
+    settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
+    plain = algorithm.__mro__[2]("MlpPolicy", TwoActions(), policy_kwargs={"net_arch": [8, 8]}, **settings)
+    advised = make(algorithm, **settings)
+    names = [name for name in advised.policy.state_dict() if not name.startswith("board.")]
+    plain.policy.load_state_dict({name: advised.policy.state_dict()[name] for name in names})
+    results = []
+    for model in (advised, plain):
+        th.manual_seed(0)
+        np.random.seed(0)
+        model.action_space.seed(0)
+        model.env.seed(0)
+        callback = BoardCallback(make_vec_env(TwoActions, 1)) if model is advised else None
+        model.learn(40, callback=callback)
+        results.append(model.policy.state_dict())
+    assert len(advised.policy.board) > 0
+    assert all(th.equal(results[0][name], results[1][name]) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [({"formation_period": -1}, "formation_period must be"), ({"n_members": 0}, "policy_kwargs.'n_members'. must be")],
+)
+def test_bad_arguments_are_one_sentence(arguments, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make(**arguments)
+
+
+@pytest.mark.slow
+def test_the_board_is_not_worse_than_its_best_member_by_far_on_pendulum():
+    env = gym.make("Pendulum-v1")
+    model = AdvBTD3("MlpPolicy", env, learning_starts=500, learning_rate=1e-3, seed=0, device="cpu")
+    model.learn(6_000, callback=BoardCallback(make_vec_env("Pendulum-v1", 1, seed=1)))
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=10, warn=False)
+    assert mean > -400
