@@ -256,7 +256,7 @@ def make_callbacks(case: Case, folder: Path, stop_at: int | None) -> list[BaseCa
     if case.algorithm in (AdvBTD3, AdvBSAC):
         test_env = _wrap(case, make_vec_env(case.env, 1, seed=6, env_kwargs=case.env_kwargs))
         board = [BoardCallback(test_env)]
-    return [Checkpoints(folder / "checkpoints", freq=40, verbose=0), Trace(), *board, evaluation, StopAt(stop_at)]
+    return [Checkpoints(folder / "checkpoints", freq=40, verbose=0), Trace(), evaluation, *board, StopAt(stop_at)]
 
 
 def run(case: Case, folder: Path, stop_at: int | None = None) -> dict[str, Any]:
