@@ -279,7 +279,7 @@ def _choose_who_acts(model: BaseAlgorithm, args: argparse.Namespace) -> Abstract
     """
     if not isinstance(model.policy, AdvisedPolicy):
         if args.board:
-            raise ValueError("--board needs a model of advb_td3 or advb_sac: this one has no board")
+            raise ValueError("--board needs a model of advb_td3, advb_sac or advb_tdc: this one has no board")
         return nullcontext()
     if args.board and (args.stochastic or len(model.policy.board) == 0):
         why = (

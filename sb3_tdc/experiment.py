@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_tdc.advb import AdvBSAC, AdvBTD3, BoardCallback
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
 from sb3_tdc.advb.algorithms import Advised
 from sb3_tdc.busy_machine import BusyMachine
 from sb3_tdc.checked_envs import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
@@ -59,6 +59,7 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
     "ddpg": DDPG,
     "advb_td3": AdvBTD3,
     "advb_sac": AdvBSAC,
+    "advb_tdc": AdvBTDC,
 }
 
 

@@ -356,7 +356,8 @@ def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
         (["--env", "Walker3d-v4"], "There is no environment 'Walker3d-v4'; did you mean Walker2d-v4"),
         (
             ["--algo", "tdd"],
-            "unknown algorithm 'tdd'; did you mean 'tdc'?; known: tdc, meow, td3, sac, ddpg, advb_td3, advb_sac",
+            "unknown algorithm 'tdd'; did you mean 'tdc'?; known: tdc, meow, td3, sac, ddpg, "
+            "advb_td3, advb_sac, advb_tdc",
         ),
         (["--evalfreq", "3"], "unknown argument '--evalfreq'; did you mean '--eval-freq'?"),
         (["-n", "many"], "argument -n/--n-timesteps: invalid int value: 'many'"),

@@ -1,4 +1,4 @@
-from sb3_tdc.advb.algorithms import AdvBSAC, AdvBTD3
+from sb3_tdc.advb.algorithms import AdvBSAC, AdvBTD3, AdvBTDC
 from sb3_tdc.advb.callback import BoardCallback
 
-__all__ = ["AdvBSAC", "AdvBTD3", "BoardCallback"]
+__all__ = ["AdvBSAC", "AdvBTD3", "AdvBTDC", "BoardCallback"]

@@ -1,4 +1,4 @@
-"""SB3's TD3 and SAC with an advisory board. No algorithm changes: only who decides about an action."""
+"""TD3, SAC and TDC with an advisory board. No algorithm changes: only who decides about an action."""
 
 from typing import Any, ClassVar
 
@@ -9,6 +9,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_tdc.advb import policies
+from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.checks import check_integer
 
 
@@ -70,3 +71,38 @@ class AdvBSAC(Advised, SAC):
         "CnnPolicy": policies.SACCnnPolicy,
         "MultiInputPolicy": policies.SACMultiInputPolicy,
     }
+
+
+class AdvBTDC(Advised, TDC):
+    """
+    TDC with the board of AdvB-TD3: members' mean actions, scored by min_i (μ_i − λσ_i) of TDC's critics.
+
+    Its policy is not TDC's own, so that the readable update applies.
+
+    :param args: those of TDC
+    :param kwargs: those of TDC; ``formation_period``: episodes before the board also acts in training
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": policies.TDCMlpPolicy,
+        "CnnPolicy": policies.TDCCnnPolicy,
+        "MultiInputPolicy": policies.TDCMultiInputPolicy,
+    }
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._advise_by_current_lam()
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """
+        TDC's updates; the board then scores with the same λ.
+
+        :param gradient_steps: number of updates
+        :param batch_size: B, transitions per update
+        """
+        super().train(gradient_steps, batch_size)
+        self._advise_by_current_lam()
+
+    def _advise_by_current_lam(self) -> None:
+        policy: Any = self.policy
+        policy.lam = self._scheduled("lam")

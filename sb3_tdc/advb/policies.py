@@ -1,18 +1,18 @@
-"""The policies of SB3's TD3 and SAC, with a board in their weights: it is saved, restored and opened with them."""
+"""The policies of TD3, SAC and TDC with a board in their weights: it is saved, restored and opened with them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import SACPolicy
-from stable_baselines3.td3.policies import TD3Policy
+from stable_baselines3.sac import policies as sac
+from stable_baselines3.td3 import policies as td3
 
 from sb3_tdc.advb.board import Board
+from sb3_tdc.tdc import policies as tdc
+from sb3_tdc.tdc.quantiles import mean_and_std
 
 
 class AdvisedPolicy(BasePolicy):
@@ -63,69 +63,54 @@ class AdvisedPolicy(BasePolicy):
         return super()._predict(observation, deterministic)  # type: ignore[safe-super]
 
 
-class TD3MlpPolicy(AdvisedPolicy, TD3Policy):
-    """SB3's TD3 policy with a board."""
+class TD3MlpPolicy(AdvisedPolicy, td3.MlpPolicy):
+    """SB3's policy of TD3 with a board."""
 
 
-class SACMlpPolicy(AdvisedPolicy, SACPolicy):
-    """SB3's SAC policy with a board."""
+class TD3CnnPolicy(AdvisedPolicy, td3.CnnPolicy):
+    """The same for images."""
 
 
-class TD3CnnPolicy(TD3MlpPolicy):
-    """:class:`TD3MlpPolicy` with ``NatureCNN`` features; the same parameters, by keyword."""
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ):
-        kwargs["features_extractor_class"] = features_extractor_class
-        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+class TD3MultiInputPolicy(AdvisedPolicy, td3.MultiInputPolicy):
+    """The same for ``Dict`` observations."""
 
 
-class TD3MultiInputPolicy(TD3MlpPolicy):
-    """:class:`TD3MlpPolicy` for ``Dict`` observations; the same parameters, by keyword."""
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ):
-        kwargs["features_extractor_class"] = features_extractor_class
-        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+class SACMlpPolicy(AdvisedPolicy, sac.MlpPolicy):
+    """SB3's policy of SAC with a board."""
 
 
-class SACCnnPolicy(SACMlpPolicy):
-    """:class:`SACMlpPolicy` with ``NatureCNN`` features; the same parameters, by keyword."""
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ):
-        kwargs["features_extractor_class"] = features_extractor_class
-        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+class SACCnnPolicy(AdvisedPolicy, sac.CnnPolicy):
+    """The same for images."""
 
 
-class SACMultiInputPolicy(SACMlpPolicy):
-    """:class:`SACMlpPolicy` for ``Dict`` observations; the same parameters, by keyword."""
+class SACMultiInputPolicy(AdvisedPolicy, sac.MultiInputPolicy):
+    """The same for ``Dict`` observations."""
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ):
-        kwargs["features_extractor_class"] = features_extractor_class
-        super().__init__(observation_space, action_space, lr_schedule, **kwargs)
+
+class RiskAdvisedPolicy(AdvisedPolicy):
+    """A board whose members are scored by quantile critics; ``lam`` is λ, which the algorithm sets."""
+
+    lam = 0.0
+
+    def score(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        Return min_i (μ_i − λσ_i) over the quantiles at (s, a).
+
+        :param obs: (B, ...)
+        :param actions: (B, A), in [-1, 1]
+        :return: (B,)
+        """
+        mean, std = mean_and_std(self.critic(obs, actions))  # type: ignore[operator]
+        return (mean - self.lam * std).amin(dim=1)
+
+
+class TDCMlpPolicy(RiskAdvisedPolicy, tdc.MlpPolicy):
+    """The policy of TDC with a board."""
+
+
+class TDCCnnPolicy(RiskAdvisedPolicy, tdc.CnnPolicy):
+    """The same for images."""
+
+
+class TDCMultiInputPolicy(RiskAdvisedPolicy, tdc.MultiInputPolicy):
+    """The same for ``Dict`` observations."""

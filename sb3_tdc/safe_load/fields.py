@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_tdc.advb import AdvBSAC, AdvBTD3
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
 from sb3_tdc.meow import MEOW
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
@@ -36,7 +36,7 @@ TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
     """The known policy classes, and the algorithm of each."""
-    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, MEOW, AdvBTD3, AdvBSAC, TD3, SAC]
+    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, MEOW, AdvBTD3, AdvBSAC, AdvBTDC, TD3, SAC]
     with suppress(ImportError):  # contrib is an extra
         from sb3_contrib import TQC
 

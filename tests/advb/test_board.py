@@ -11,10 +11,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc import load_safely
-from sb3_tdc.advb import AdvBSAC, AdvBTD3, BoardCallback
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
 from tests.tdc.test_update import OBS, TwoActions
 
-ALGORITHMS = pytest.mark.parametrize("algorithm", [AdvBTD3, AdvBSAC])
+ALGORITHMS = pytest.mark.parametrize("algorithm", [AdvBTD3, AdvBSAC, AdvBTDC])
 
 
 def make(algorithm=AdvBTD3, n_members=3, env=None, **kwargs):
@@ -70,9 +70,16 @@ def test_an_equal_return_comes_after_those_that_were_there():
     assert [board.propose(actor, value) for value in (1.0, 1.0, 1.0, 1.0)] == [0, 1, 2, None]
 
 
+def brute_force_score(model, obs, action):
+    predictions = model.policy.critic(obs, action)
+    if not isinstance(model, AdvBTDC):
+        return min(float(q) for q in predictions)
+    return min(float(z.mean()) - 3.0 * float(np.std(z.numpy())) for z in predictions[0])
+
+
 @ALGORITHMS
 def test_the_cooperative_action_is_the_best_by_brute_force(algorithm):
-    model = make(algorithm)
+    model = make(algorithm, **({"lam": 3.0} if algorithm is AdvBTDC else {}))
     fill(model, [1.0, 3.0, 2.0])
     policy, obs = model.policy, th.tensor(observations())
     perturb(policy.critic, 7)
@@ -81,7 +88,7 @@ def test_the_cooperative_action_is_the_best_by_brute_force(algorithm):
         members = set()
         for i in range(len(obs)):
             advice = [member._predict(obs[i : i + 1], deterministic=True) for member in policy.board.members]
-            values = [min(float(q) for q in policy.critic(obs[i : i + 1], action)) for action in advice]
+            values = [brute_force_score(model, obs[i : i + 1], action) for action in advice]
             members.add(int(np.argmax(values)))
             assert th.allclose(chosen[i], advice[int(np.argmax(values))][0], atol=1e-6)
     assert len(members) > 1  # not always the same
@@ -201,6 +208,7 @@ def test_a_board_is_saved_and_opened_with_its_model(tmp_path, algorithm):
 def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
     """The same weights as SB3's algorithm that begins with them, with a board that is filled beside it."""
     settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
+    settings |= {"fused": False} if algorithm is AdvBTDC else {}  # the update of a custom policy class
     plain = algorithm.__mro__[2]("MlpPolicy", TwoActions(), policy_kwargs={"net_arch": [8, 8]}, **settings)
     advised = make(algorithm, **settings)
     names = [name for name in advised.policy.state_dict() if not name.startswith("board.")]
@@ -216,6 +224,15 @@ def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
         results.append(model.policy.state_dict())
     assert len(advised.policy.board) > 0
     assert all(th.equal(results[0][name], results[1][name]) for name in names)
+
+
+def test_the_board_of_tdc_scores_with_the_current_lam(tmp_path):
+    model = make(AdvBTDC, lam=lambda left: left)
+    assert model.policy.lam == 1.0
+    model.learn(20)
+    assert model.policy.lam == pytest.approx(0.0, abs=1e-6)
+    make(AdvBTDC, lam=0.7).save(tmp_path / "model.zip")
+    assert [load(tmp_path / "model.zip").policy.lam for load in (AdvBTDC.load, load_safely)] == [0.7, 0.7]
 
 
 @pytest.mark.parametrize(
