@@ -132,7 +132,7 @@ def test_an_environment_that_cannot_be_made_is_a_sentence(runs, monkeypatch, cap
     with pytest.raises(SystemExit) as exit_:
         enjoy.main([str(runs["Fails"]), "--no-render"])
     assert exit_.value.code == 2
-    assert "error: Fails-v0 cannot be made: no licence" in capsys.readouterr().err
+    assert "error: Fails-v0 cannot be made: RuntimeError: no licence (" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         enjoy.main([str(runs["Drawn"]), "--no-render", "--env-kwargs", "gravity:3"])
     assert "error: Drawn-v0 cannot be made: " in capsys.readouterr().err

@@ -213,17 +213,19 @@ def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
     advised = make(algorithm, **settings)
     names = [name for name in advised.policy.state_dict() if not name.startswith("board.")]
     plain.policy.load_state_dict({name: advised.policy.state_dict()[name] for name in names})
-    results = []
+    before = {name: advised.policy.state_dict()[name].clone() for name in names}
+    results, test_env = [], make_vec_env(TwoActions, 1, seed=1)
     for model in (advised, plain):
         th.manual_seed(0)
         np.random.seed(0)
         model.action_space.seed(0)
         model.env.seed(0)
-        callback = BoardCallback(make_vec_env(TwoActions, 1)) if model is advised else None
+        callback = BoardCallback(test_env) if model is advised else None
         model.learn(40, callback=callback)
         results.append(model.policy.state_dict())
     assert len(advised.policy.board) > 0
     assert all(th.equal(results[0][name], results[1][name]) for name in names)
+    assert not all(th.equal(results[0][name], before[name]) for name in names)  # it has learned
 
 
 def test_the_board_of_tdc_scores_with_the_current_lam(tmp_path):
