@@ -80,6 +80,14 @@ def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
     return raw + Op.STOP
 
 
+def noise_of_doubled_lists() -> bytes:
+    """Twenty-six levels: an array of so many numbers could be made, slowly."""
+    lists = doubled(times=26)[: -len(Op.STOP)] + Op.POP * 27
+    state = Op.EMPTY_DICT + Op.MARK + Op.text("_mu") + Op.get(26) + Op.text("_sigma") + Op.integer(1) + Op.SETITEMS
+    noise = Op.name("stable_baselines3.common.noise", "NormalActionNoise") + Op.EMPTY_TUPLE + b"\x81"
+    return lists + noise + state + Op.BUILD + Op.STOP
+
+
 RAW = {
     "lists doubled": doubled,
     "tuples doubled": doubled_tuples,
@@ -99,6 +107,9 @@ ATTACKS = {
         for name, raw in RAW.items()
         for field in (FIELDS if name.endswith("doubled") else ("policy_kwargs", "_last_obs"))
     },
+    "noise whose mean is lists doubled": lambda folder, model: with_fields(
+        model, folder / "x.zip", action_noise=pickled(noise_of_doubled_lists())
+    ),
     "sixty boxes of one array": lambda folder, model: with_fields(
         model, folder / "x.zip", observation_space=pickled(boxes_of_one_array())
     ),

@@ -41,7 +41,9 @@ ATTACKS = {
     "negative numbers": _policy(tensor(10, (-1,), (1,)), data_0=_NUMBERS),
     "a storage beyond its record": _policy(tensor(1000, (1000,), (1,)), data_0=_NUMBERS),
     "a storage without a record": _policy(tensor(10, (10,), (1,))),
-    "a storage of two types": _policy(Op.tuple_of(_GOOD, tensor(5, (5,), (1,), kind="DoubleStorage")), data_0=_NUMBERS),
+    "a storage of two types": _policy(
+        _GOOD + Op.SETITEM + Op.text("v") + tensor(5, (5,), (1,), kind="DoubleStorage"), data_0=_NUMBERS
+    ),
     "BUILD on a tensor": _policy(_GOOD + Op.tuple_of(_SET) + Op.BUILD, data_0=_NUMBERS),
     "BUILD on a tensor with a mapping": _policy(
         _GOOD + Op.EMPTY_DICT + Op.text("data") + _GOOD + Op.SETITEM + Op.BUILD, data_0=_NUMBERS
