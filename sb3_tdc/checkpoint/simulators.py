@@ -137,7 +137,7 @@ def capture_mj_data(data: Any) -> dict[str, Any]:
 
 
 def restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
-    """Give an ``MjData`` that is there its state, if it is of the same model."""
+    """Give an ``MjData`` that is there its state, if it is of the same model; return it, or another with this state."""
     import mujoco
 
     model = _model_bytes(existing_as(mujoco.MjData, existing, "MjData").model)
@@ -145,6 +145,8 @@ def restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
         raise NotRestoredError("the environment has another MuJoCo model now, or has changed its model")
     source = mujoco.MjData.__new__(mujoco.MjData)
     source.__setstate__(state["before"] + model + state["after"])
+    if not hasattr(mujoco, "mj_copyData"):  # MuJoCo's older bindings cannot write into the one that is there
+        return source
     mujoco.mj_copyData(existing, existing.model, source)
     return existing
 
