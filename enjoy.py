@@ -1,6 +1,6 @@
 import sys
 
-from sb3_tdc.enjoy import main
+from sb3_tdc.cli.enjoy import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,7 +1,7 @@
 import sys
 
 try:
-    from experiments.tune import main
+    from sb3_tdc.cli.tune import main
 except ImportError as error:
     sys.exit(str(error))
 

@@ -184,7 +184,7 @@ def learn_steps(name: str, model: Any) -> Callable[[int], None]:
 
 
 def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
-    """Whole environment steps of every peer, then gradient steps of TDC beside its matrix products."""
+    """Whole environment steps of every peer, then gradient steps of TDC next to its matrix products."""
     models = make_models(env_id)
     learn = {name: learn_steps(name, model) for name, model in models.items()}
     for function in learn.values():
@@ -201,7 +201,7 @@ def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
 
 
 def measure_scaling(rounds: int) -> dict[str, Any]:
-    """Gradient steps of TDC beside the matrix products, against quantiles, batch and width."""
+    """Gradient steps of TDC next to the matrix products, against quantiles, batch and width."""
     from sb3_tdc import TDC
 
     def measure(n_quantiles: int = 64, batch_size: int = 256, width: int = 256) -> dict[str, list[float]]:
@@ -323,7 +323,7 @@ def main() -> None:
         work(arguments)
         return
 
-    from benchmarks.report import write_report
+    from benchmarks.speed_report import write_report
 
     start = time.perf_counter()
     results: dict[str, Any] = {"hardware": hardware(), "rounds": arguments.rounds, "seconds": arguments.seconds}

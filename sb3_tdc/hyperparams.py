@@ -5,7 +5,6 @@ Knows neither the command line nor environments.
 """
 
 import collections.abc
-import difflib
 import importlib
 import inspect
 import re
@@ -22,7 +21,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_tdc import plain_yaml
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.checks import suggest
 
 # What an entry may say besides the keyword arguments of the algorithm, with its type
 _RUN_KEYS: dict[str, Any] = {
@@ -78,7 +78,7 @@ class Hyperparams:
 
 
 def hyperparams_file(algo: str) -> Path:
-    """:return: the file of an algorithm that comes with this package"""
+    """Return the file of an algorithm that comes with this package."""
     package = Path(__file__).parent
     installed, checkout = package / "_hyperparams", package.parent / "hyperparams"
     return (installed if installed.is_dir() else checkout) / f"{algo}.yml"
@@ -104,7 +104,7 @@ def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], str]:
 
 
 def _nearest_version(env_id: str, names: Iterable[Any]) -> str:
-    """:return: of ``Name-v4`` and its like the one next to an id; of two that are as near, the newer; or ``default``"""
+    """Return the name that is an id's nearest version; of two that are as near, the newer; or ``default``."""
     names = [str(name) for name in names]
     if env_id in names:
         return env_id
@@ -161,15 +161,8 @@ def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> 
     )
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
-    """:return: ", did you mean ...?", or nothing if no known name is near"""
-    by_lower = {str(k).lower(): k for k in known}
-    nearest = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
-    return f"; did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
-
-
 def constructor_hints(cls: type) -> dict[str, Any]:
-    """:return: the annotation of every argument of a constructor, those it passes on by ``**kwargs`` included"""
+    """Return the annotation of every argument of a constructor, those it passes on by ``**kwargs`` included."""
     hints: dict[str, Any] = {}
     for base in cls.__mro__:
         if "__init__" in vars(base):
@@ -214,7 +207,11 @@ def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], wher
 
 
 def _convert(value: Any, hint: Any) -> Any:
-    """:return: the value as the annotation wants it; :raises TypeError, ValueError: if it cannot be"""
+    """
+    Return the value as the annotation wants it.
+
+    :raises TypeError, ValueError: if it cannot be
+    """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return value

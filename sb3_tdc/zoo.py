@@ -63,6 +63,8 @@ def sample_meow_params(trial: Any, n_actions: int, n_envs: int, additional_args:
 
 def convert_meow_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """
+    Convert the parameters of a trial of Optuna.
+
     :param sampled: the parameters of a finished Optuna trial
     :return: hyperparameters as in a YAML file
     """
@@ -75,6 +77,8 @@ def convert_meow_params(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """
+    Convert the parameters of a trial of Optuna.
+
     :param sampled: the parameters of a finished Optuna trial
     :return: hyperparameters as in a YAML file
     """

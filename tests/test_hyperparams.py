@@ -9,8 +9,9 @@ from stable_baselines3 import DDPG, HerReplayBuffer
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_tdc import TDC
-from sb3_tdc.experiment import ALGORITHMS
-from sb3_tdc.hyperparams import hyperparams_file, parse, read_entry, suggest
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.checks import suggest
+from sb3_tdc.hyperparams import hyperparams_file, parse, read_entry
 
 # Table 1: steps, warm-up, λ, τ, learning rates of actor and critics
 TABLE_1 = {

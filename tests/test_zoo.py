@@ -3,7 +3,7 @@
 import pytest
 
 from sb3_tdc import MEOW, TDC, zoo
-from sb3_tdc import train as our_train
+from sb3_tdc.cli import train as our_train
 
 rl_zoo3 = pytest.importorskip("rl_zoo3")
 

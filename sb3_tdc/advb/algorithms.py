@@ -9,8 +9,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_tdc.advb import policies
+from sb3_tdc.common.checks import check_integer
+from sb3_tdc.common.saved_fields import SavedField, integer
 from sb3_tdc.tdc import TDC
-from sb3_tdc.tdc.checks import check_integer
 
 
 class Advised(OffPolicyAlgorithm):
@@ -22,6 +23,11 @@ class Advised(OffPolicyAlgorithm):
     :param args: those of the algorithm
     :param kwargs: those of the algorithm; ``policy_kwargs`` may hold ``n_members`` (10)
     """
+
+    saved_fields: ClassVar[dict[str, SavedField]] = {
+        "formation_period": SavedField(integer(0)),
+        "policy_kwargs.n_members": SavedField(integer(1, 256), is_required=False),
+    }
 
     def __init__(self, *args: Any, formation_period: int = 10_000, **kwargs: Any):
         self.formation_period = formation_period
@@ -105,4 +111,4 @@ class AdvBTDC(Advised, TDC):
 
     def _advise_by_current_lam(self) -> None:
         policy: Any = self.policy
-        policy.lam = self._scheduled("lam")
+        policy.lam = self.scheduled("lam")

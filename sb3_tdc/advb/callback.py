@@ -14,7 +14,7 @@ class BoardCallback(BaseCallback):
 
     Test episodes cost steps that ``num_timesteps`` does not count: they are logged as ``board/test_steps``.
 
-    :param test_env: one environment of its own, wrapped as that of the training
+    :param test_env: one separate environment, wrapped as that of the training
     :param verbose: 1 prints every new member
     """
 

@@ -12,9 +12,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update, update_learning_rate
 from torch import nn
 
+from sb3_tdc.common.checks import check_action_space, check_integer, check_number
+from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
+from sb3_tdc.common.saved_fields import SavedField, integer, number
 from sb3_tdc.meow.policies import CnnPolicy, MEOWPolicy, MlpPolicy, MultiInputPolicy
-from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
-from sb3_tdc.tdc.off_policy import CheckedOffPolicyAlgorithm
 
 SelfMEOW = TypeVar("SelfMEOW", bound="MEOW")
 
@@ -60,6 +61,13 @@ class MEOW(CheckedOffPolicyAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    saved_fields: ClassVar[dict[str, SavedField]] = {
+        "ent_coef": SavedField(number(above=0.0)),
+        "max_grad_norm": SavedField(number(above=0.0)),
+        "policy_kwargs.n_blocks": SavedField(integer(1, 256), is_required=False),
+    }
+    changeable: ClassVar[tuple[str, ...]] = ("ent_coef", "max_grad_norm")
+    color: ClassVar[str | None] = "#E69F00"
     policy: MEOWPolicy
     replay_buffer: ReplayBuffer
 
@@ -156,7 +164,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         """
         ent_coef = _check_positive("ent_coef", self.ent_coef)
         self.policy.set_training_mode(True)
-        update_learning_rate(self.policy.optimizer, self._scheduled("learning_rate"))
+        update_learning_rate(self.policy.optimizer, self.scheduled("learning_rate"))
 
         for _ in range(gradient_steps):
             self._n_updates += 1

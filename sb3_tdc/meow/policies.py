@@ -16,8 +16,8 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.meow.flow import ConditionalFlow, Swish
-from sb3_tdc.tdc.policies import StackedLinear
 
 
 class SoftValues(NamedTuple):
@@ -128,7 +128,7 @@ class MEOWPolicy(BasePolicy):
     :param optimizer_class: The optimizer, ``th.optim.Adam`` by default (then the fused one)
     :param optimizer_kwargs: Additional keyword arguments for the optimizer, without the learning rate
     :param shift_arch: Units of the hidden layers of the reward shifts, ``[256, 256]`` by default
-    :param n_shifts: Number of reward shifts; the smallest value of the target network counts
+    :param n_shifts: Number of reward shifts; the target takes the smallest value
     :param n_blocks: Blocks of two couplings
     :param dropout: Probability that a hidden unit of a coupling is dropped while it learns
     :param log_std_min: Lower limit of log σ(s) of the latent Gaussian
@@ -189,7 +189,7 @@ class MEOWPolicy(BasePolicy):
 
     def make_network(self) -> EnergyFlow:
         """
-        Build a flow with a features extractor of its own.
+        Build a flow with its own features extractor.
 
         :return: the flow
         """
@@ -239,7 +239,7 @@ MlpPolicy = MEOWPolicy
 
 
 class CnnPolicy(MEOWPolicy):
-    """:class:`MEOWPolicy` with ``NatureCNN`` features; the same parameters, by keyword."""
+    """Policy with ``NatureCNN`` features; the same parameters as :class:`MEOWPolicy`, by keyword."""
 
     def __init__(
         self,
@@ -254,7 +254,7 @@ class CnnPolicy(MEOWPolicy):
 
 
 class MultiInputPolicy(MEOWPolicy):
-    """:class:`MEOWPolicy` for ``Dict`` observations; the same parameters, by keyword."""
+    """Policy for ``Dict`` observations; the same parameters as :class:`MEOWPolicy`, by keyword."""
 
     def __init__(
         self,

@@ -1,5 +1,5 @@
 """
-Open saved models of others: nothing in the file is imported, called or unpickled.
+Open untrusted saved models: nothing in the file is imported, called or unpickled.
 
 SB3's ``load`` runs whatever a zip asks for, and so do its replay buffers and ``VecNormalize`` files. Here every pickled
 field is read as data, recognised by name and rebuilt from known classes, or refused by name; sizes are bounded before

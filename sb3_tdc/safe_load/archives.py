@@ -5,7 +5,8 @@ import re
 import zipfile
 from typing import IO
 
-from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
+from sb3_tdc.common.untrusted import shown
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 
 MAX_BYTES = 2**30  # of a file
 MAX_RATIO = 100  # of decompressed to compressed; SB3 itself does not compress
@@ -13,12 +14,14 @@ MAX_DIRECTORY = 2**20  # bytes of a zip's list of entries
 
 MODEL_ENTRIES = re.compile(
     r"data|_stable_baselines3_version|system_info\.txt|pytorch_variables\.pth|tensors\.pth|policy\.pth"
-    r"|(actor|critic|policy)\.optimizer\.pth|ent_coef_optimizer\.pth"
+    r"|([a-z_]{1,40}\.)?([a-z_]{1,40}_)?optimizer\.pth"
 )
 
 
 def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget) -> dict[str, bytes]:
     """
+    Read the entries of a zip, bounded before they are decompressed.
+
     :param allowed: what entries may be called
     :param budget: of all that is read from the file
     :return: the bytes of each entry

@@ -1,7 +1,6 @@
-"""What reading one file may cost, all of its parts together; and how what it holds is shown in a message."""
+"""What reading one file may cost, all of its parts together."""
 
 import time
-from typing import Any
 
 MAX_OPCODES = 1_000_000  # SB3 writes some thousands for a model
 MAX_NODES = 200_000  # values, each counted as often as it is reached
@@ -28,7 +27,11 @@ class Budget:
         self.deadline = time.monotonic() + MAX_SECONDS + size / BYTES_PER_SECOND
 
     def take_opcode(self) -> None:
-        """:raises UnsafeFileError: if a pickle is too long, or takes too much time"""
+        """
+        Pay for an operation of a pickle.
+
+        :raises UnsafeFileError: if a pickle is too long, or takes too much time
+        """
         self.opcodes -= 1
         if self.opcodes < 0:
             raise UnsafeFileError(f"pickles of more than {MAX_OPCODES:,} operations")
@@ -36,37 +39,31 @@ class Budget:
             self.check_time()
 
     def take_nodes(self, n: int) -> None:
-        """:raises UnsafeFileError: if the values would be too many"""
+        """
+        Pay for values.
+
+        :raises UnsafeFileError: if the values would be too many
+        """
         self.nodes -= n
         if self.nodes < 0:
             raise UnsafeFileError(f"more than {MAX_NODES:,} values")
 
     def take_bytes(self, n: int) -> None:
-        """:raises UnsafeFileError: if what is decompressed, copied and made would be too large"""
+        """
+        Pay for bytes that are decompressed, copied or made.
+
+        :raises UnsafeFileError: if what is decompressed, copied and made would be too large
+        """
         self.bytes -= n
         if self.bytes < 0:
             raise UnsafeFileError("it would take far more memory than it has bytes")
         self.check_time()
 
     def check_time(self) -> None:
-        """:raises UnsafeFileError: if reading has taken too long"""
+        """
+        Check the time that reading has taken.
+
+        :raises UnsafeFileError: if reading has taken too long
+        """
         if time.monotonic() > self.deadline:
             raise UnsafeFileError("it takes too long to read")
-
-
-def shown(value: Any) -> str:
-    """Return a short text for a value of a file: at most its first letters, and nothing that drives a terminal."""
-    if isinstance(value, bool | float | None):
-        return str(value)
-    if isinstance(value, int):
-        return str(value) if value.bit_length() <= 64 else f"an integer of {value.bit_length():,} bits"
-    if isinstance(value, str):
-        return escaped(repr(value[:60]) if len(value) <= 60 else f"{value[:60]!r}…")
-    if isinstance(value, type):
-        return f"the class {escaped(value.__name__)}"
-    return f"a {escaped(type(value).__name__)}"
-
-
-def escaped(text: str, length: int = 300) -> str:
-    """Return a text in printable letters: control characters as escapes, and not more than ``length`` of them."""
-    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text[:length])

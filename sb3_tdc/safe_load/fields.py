@@ -4,44 +4,50 @@ import base64
 import json
 import math
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
 from gymnasium import spaces
-from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.saved_fields import SavedField
+from sb3_tdc.common.untrusted import shown
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
-from sb3_tdc.meow import MEOW
-from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
-from sb3_tdc.safe_load.checks import boolean, integer, is_plain, number, reading
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import Name, Rebuild, names_in, read_pickle
-from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, name_of
-from sb3_tdc.tdc import TDC
+from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, pickled_name
+from sb3_tdc.safe_load.reading import reading
+from sb3_tdc.safe_load.sb3_fields import OF_SB3, OFF_POLICY
 
 MAX_REPLAY_BYTES = 2**36  # of the replay buffer that a loaded model gets
 MAX_HER_SLOTS = 2_000_000
-MAX_CRITICS = 256
-MAX_ENVS = 10_000
 # What is made of the argument ent_coef
 TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
-    """The known policy classes, and the algorithm of each."""
-    algorithms: list[type[OffPolicyAlgorithm]] = [TDC, MEOW, AdvBTD3, AdvBSAC, AdvBTDC, TD3, SAC]
+    """Return the known policy classes, and the algorithm of each: of TD3 and DDPG, which share them, TD3."""
+    algorithms = list(ALGORITHMS.values())
     with suppress(ImportError):  # contrib is an extra
         from sb3_contrib import TQC
 
         algorithms.append(TQC)
-    return {policy: algorithm for algorithm in algorithms for policy in algorithm.policy_aliases.values()}
+    return {policy: algorithm for algorithm in algorithms[::-1] for policy in algorithm.policy_aliases.values()}
+
+
+def saved_fields(algorithm: type[OffPolicyAlgorithm]) -> dict[str, SavedField]:
+    """
+    Return the fields that an algorithm saves, by name; those of ``policy_kwargs`` as ``policy_kwargs.<name>``.
+
+    :param algorithm: it and its bases declare their own in ``saved_fields``
+    """
+    fields = dict(OFF_POLICY)
+    for base in reversed(algorithm.__mro__):
+        fields |= OF_SB3.get(f"{base.__module__}.{base.__qualname__}", {}) | vars(base).get("saved_fields", {})
+    return fields
 
 
 def nearest_algorithm(policy_class: Any) -> type[OffPolicyAlgorithm] | None:
@@ -50,104 +56,6 @@ def nearest_algorithm(policy_class: Any) -> type[OffPolicyAlgorithm] | None:
     return next((algorithm for base, algorithm in known_policies().items() if base in bases), None)
 
 
-def _instance(*kinds: type) -> Callable[[str, Any], Any]:
-    def check(name: str, value: Any) -> Any:
-        if isinstance(value, bool) or not isinstance(value, kinds):
-            raise ValueError(f"{name} must be a {' or '.join(k.__name__ for k in kinds)}, got {shown(value)}")
-        return value
-
-    return check
-
-
-def _schedule(name: str, value: Any) -> Any:
-    return value if callable(value) and not isinstance(value, type) else number(0.0)(name, value)
-
-
-def _text_or_number(name: str, value: Any) -> Any:
-    return value if isinstance(value, str) and len(value) < 100 else number()(name, value)
-
-
-def _noise(name: str, value: Any) -> Any:
-    return value if isinstance(value, ActionNoise) else number(0.0)(name, value)
-
-
-def _subclass(base: type) -> Callable[[str, Any], Any]:
-    def check(name: str, value: Any) -> Any:
-        if not isinstance(value, type) or not issubclass(value, base):
-            raise ValueError(f"{name} must be a {base.__name__} class, got {shown(value)}")
-        return value
-
-    return check
-
-
-def _train_freq(name: str, value: Any) -> Any:
-    if isinstance(value, TrainFreq):
-        return value
-    if isinstance(value, list) and len(value) == 2 and value[1] in ("step", "episode"):
-        return (integer(1)(name, value[0]), value[1])
-    return integer(1)(name, value)
-
-
-def _arguments(name: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value) or not is_plain(value):
-        raise ValueError(f"{name} must be a mapping of names to finite numbers, texts and known classes")
-    for counted in ("n_critics", "n_blocks", "n_members"):  # so many networks are built before anything is compared
-        if value.get(counted) is not None:
-            integer(1, MAX_CRITICS)(counted, value[counted])
-    return value
-
-
-def _none(name: str, value: Any) -> None:
-    if value is not None:
-        raise ValueError(f"{name} must be null, got {shown(value)}")
-
-
-def _or_none(check: Callable[[str, Any], Any]) -> Callable[[str, Any], Any]:
-    return lambda name, value: None if value is None else check(name, value)
-
-
-# Every field that is taken from a file, and what it may be
-_FIELDS: dict[str, Callable[[str, Any], Any]] = {
-    "policy_class": _subclass(BasePolicy),
-    "policy_kwargs": _arguments,
-    "observation_space": _instance(spaces.Space),
-    "action_space": _instance(spaces.Box),
-    "learning_rate": _schedule,
-    "lam": _schedule,
-    "qf_learning_rate": _or_none(_schedule),
-    "action_noise": _or_none(_noise),
-    "train_freq": _train_freq,
-    "replay_buffer_class": _or_none(_subclass(ReplayBuffer)),
-    "replay_buffer_kwargs": _arguments,
-    "ent_coef": _text_or_number,
-    "target_entropy": _or_none(_text_or_number),
-    "seed": _or_none(integer(0)),
-    "fused": _or_none(boolean),
-    "verbose": integer(0, 2),
-    "n_envs": integer(1, MAX_ENVS),
-    **dict.fromkeys(TEMPERATURE, _none),  # where there is one, it is a tensor, and elsewhere in the file
-    **dict.fromkeys(("gradient_steps", "sde_sample_freq"), integer(-1)),
-    **dict.fromkeys(("buffer_size", "batch_size", "n_steps", "policy_delay", "target_update_interval"), integer(1)),
-    **dict.fromkeys(
-        (
-            *("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"),
-            *("learning_starts", "formation_period", "_stats_window_size", "top_quantiles_to_drop_per_net"),
-        ),
-        integer(0),
-    ),
-    "gamma": number(0.0, 1.0),
-    "tau": number(maximum=1.0, above=0.0),
-    "kappa": number(above=0.0),
-    "_current_progress_remaining": number(-1.0, 1.0),
-    **dict.fromkeys(("target_policy_noise", "target_noise_clip", "max_grad_norm"), number(0.0)),
-    **dict.fromkeys(
-        (
-            *("use_sde", "use_sde_at_warmup", "optimize_memory_usage", "stochastic_actor", "_built_stochastic_actor"),
-            *("remove_time_limit_termination",),
-        ),
-        boolean,
-    ),
-}  # fmt: skip
 # What is made anew when a model is set up or learns; the file's is not looked at
 _MADE_ANEW = {
     "lr_schedule", "start_time", "ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs",
@@ -157,36 +65,66 @@ _MADE_ANEW = {
 }  # fmt: skip
 
 
-def read_fields(raw: bytes, custom_objects: dict[str, Any], budget: Budget) -> dict[str, Any]:
+def read_fields(
+    raw: bytes, custom_objects: dict[str, Any], budget: Budget
+) -> tuple[dict[str, Any], type[OffPolicyAlgorithm]]:
     """
+    Read the fields of a saved model.
+
+    :param raw: the entry ``data``
+    :param custom_objects: what to take for fields of the file, which are then not looked at
     :param budget: of the file
-    :return: the fields of ``data`` that are known, each checked; those of ``custom_objects`` as they are given
-    :raises UnsafeFileError: for any other, by name
+    :return: the fields that are known, each checked, and the algorithm that saved them
+    :raises UnsafeFileError: for any other field, by name
     """
     data = parse_data(raw)
-    classes = {**CLASSES, **{name_of(policy): policy for policy in known_policies()}}
+    policies = known_policies()
+    make = Rebuild({**CLASSES, **{pickled_name(policy): policy for policy in policies}}, CALLS, budget)
+    policy_class = custom_objects.get("policy_class")
+    if policy_class is None and "policy_class" in data:
+        policy_class = _read_field("policy_class", data["policy_class"], OFF_POLICY["policy_class"], make)
+    algorithm = policies.get(policy_class) or nearest_algorithm(policy_class)
+    if algorithm is None:
+        known = sorted({each.__name__ for each in policies.values()})
+        raise UnsafeFileError(f"it has no policy_class of {', '.join(known)}")
+    declared = saved_fields(algorithm)
     fields = {}
     for name, value in data.items():
         if name in custom_objects:
             fields[name] = custom_objects[name]
-        elif name in _FIELDS:
-            with reading(f"the field {name} (custom_objects can replace it)"):
-                if isinstance(value, dict) and ":serialized:" in value:
-                    value = Rebuild(classes, CALLS, budget)(_pickled(value, budget))
-                fields[name] = _FIELDS[name](name, value)
+        elif name in declared:
+            fields[name] = _read_field(name, value, declared[name], make)
         elif name not in _MADE_ANEW:
             raise UnsafeFileError(f"the field {shown(name)} is unknown (custom_objects can replace it)")
     _warn_of_code(data, custom_objects, budget)
-    known = constructor_hints(fields.get("policy_class", BasePolicy)).keys() - POLICY_ARGUMENTS
     fields.setdefault("policy_kwargs", {}).pop("device", None)
-    for name in fields["policy_kwargs"]:
+    _check_policy_arguments(fields["policy_kwargs"], fields.get("policy_class", BasePolicy), declared)
+    for name, field in declared.items():
+        if field.is_required and name not in {**fields, **custom_objects}:
+            raise UnsafeFileError(f"the field {name} is missing (custom_objects can give it)")
+    return fields, algorithm
+
+
+def _read_field(name: str, value: Any, declared: SavedField, make: Rebuild) -> Any:
+    with reading(f"the field {name} (custom_objects can replace it)"):
+        if isinstance(value, dict) and ":serialized:" in value:
+            value = make(_pickled(value, make.budget))
+        return declared.check(name, value)
+
+
+def _check_policy_arguments(arguments: dict[str, Any], policy_class: Any, declared: dict[str, SavedField]) -> None:
+    known = constructor_hints(policy_class).keys() - POLICY_ARGUMENTS
+    for name, value in arguments.items():
         if name not in known:
             raise UnsafeFileError(f"the field policy_kwargs has the unknown key {shown(name)}")
-    return fields
+        field = declared.get(f"policy_kwargs.{name}")
+        if field is not None and value is not None:
+            with reading("the field policy_kwargs (custom_objects can replace it)"):
+                field.check(name, value)
 
 
 def _pickled(value: Any, budget: Budget) -> Any:
-    """:return: what :func:`read_pickle` makes of a pickled field"""
+    """Return what :func:`read_pickle` makes of a pickled field."""
     text = value[":serialized:"]
     if not isinstance(text, str):
         raise UnsafeFileError("its pickle is not a text")
@@ -196,12 +134,14 @@ def _pickled(value: Any, budget: Budget) -> Any:
 
 def foreign_names(value: Any, budget: Budget) -> list[str]:
     """
+    List the code that SB3's ``load`` would run for a field.
+
     :param value: a field of ``data``
     :return: what SB3's ``load`` would import or call for it that is not known to be harmless, sorted
     """
     if not (isinstance(value, dict) and ":serialized:" in value):
         return []
-    policies = {name_of(policy) for policy in known_policies()}
+    policies = {pickled_name(policy) for policy in known_policies()}
     known = {*CLASSES, *CALLS, *policies, *_HARMLESS}
     return sorted(str(name) for name in names_in(_pickled(value, budget)) if name not in known)
 
@@ -239,7 +179,11 @@ _MAX_JSON = 500_000
 
 
 def parse_data(raw: bytes) -> dict[str, Any]:
-    """:raises UnsafeFileError: unless it is a mapping of JSON, each key once, of a reasonable number of values"""
+    """
+    Parse the entry ``data``.
+
+    :raises UnsafeFileError: unless it is a mapping of JSON, each key once, of a reasonable number of values
+    """
     with reading("data"):
         if sum(map(raw.count, (b"[", b"{", b","))) > _MAX_JSON:
             raise UnsafeFileError("it has too many values")
@@ -255,35 +199,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-# What SB3 writes of every off-policy algorithm, and of each; without one, a default would be taken for it in silence
-REQUIRED = (
-    *("policy_class", "learning_rate", "gamma", "tau", "batch_size", "buffer_size", "learning_starts", "train_freq"),
-    *("gradient_steps", "num_timesteps", "_n_updates", "_episode_num", "seed", "action_noise", "use_sde"),
-    *("optimize_memory_usage", "replay_buffer_class", "replay_buffer_kwargs"),
-)
-_OF_TD3 = ("policy_delay", "target_policy_noise", "target_noise_clip")
-_OF_SAC = ("ent_coef", "target_entropy", "target_update_interval")
-REQUIRED_OF: dict[str, tuple[str, ...]] = {
-    "TD3": _OF_TD3,
-    "SAC": _OF_SAC,
-    "TQC": (*_OF_SAC, "top_quantiles_to_drop_per_net"),
-    "MEOW": ("ent_coef",),
-    "TDC": (*_OF_TD3, "lam", "kappa", "qf_learning_rate", "stochastic_actor", "ent_coef", "target_entropy"),
-}
-
-
-def check_complete(fields: dict[str, Any], algorithm: type[OffPolicyAlgorithm]) -> None:
-    """
-    :param algorithm: that the policy is of
-    :raises UnsafeFileError: if a field is missing that SB3 always writes
-    """
-    for name in (*REQUIRED, *REQUIRED_OF.get(algorithm.__name__, ())):
-        if name not in fields:
-            raise UnsafeFileError(f"the field {name} is missing (custom_objects can give it)")
-
-
 def is_her(fields: dict[str, Any]) -> bool:
-    """Whether the model gets a replay buffer with hindsight."""
+    """Return whether the model gets a replay buffer with hindsight."""
     kind = fields.get("replay_buffer_class")
     return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 

@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import IO, Any, NamedTuple
 
-from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, escaped
+from sb3_tdc.common.untrusted import escaped
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 
 MAX_DEPTH = 64
 MAX_INTEGER_BITS = 128  # numpy's generators have states of that size
@@ -60,6 +61,8 @@ MAX_KEY = 2**32  # integers below it cannot be chosen so that their hashes colli
 
 def read_pickle(data: bytes | IO[bytes], budget: Budget) -> Any:
     """
+    Read a pickle without importing or calling anything.
+
     :param data: a pickle of protocol 2 or later, or a file whose ``read(n)`` makes nothing larger than what is left
     :param budget: of the file that it is in
     :return: numbers, texts, bytes, tuples, lists, dicts and sets of these; :class:`Name`; :class:`Call`
@@ -190,6 +193,8 @@ class Rebuild:
 
     def __call__(self, part: Any) -> Any:
         """
+        Rebuild a part of a value.
+
         :param part: of the value
         :raises UnsafeFileError: for a name or a call that is not known, by name
         """

@@ -1,44 +1,43 @@
-"""``python -m sb3_tdc.safe_load FILE``: what a saved file holds, what of it is code, and whether it would be opened."""
+"""What a saved file holds, what of it is code, and whether it would be opened."""
 
 import contextlib
 import io
-import json
 import mmap
-import sys
 import warnings
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
-from sb3_tdc.safe_load.budget import Budget, escaped
-from sb3_tdc.safe_load.checks import reading
+from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES, foreign_names, parse_data
-from sb3_tdc.safe_load.files import open_regular
 from sb3_tdc.safe_load.inert_pickle import Call, names_in, read_pickle
-from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, name_of
+from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, pickled_name
 from sb3_tdc.safe_load.models import load_safely
+from sb3_tdc.safe_load.reading import reading
+from sb3_tdc.safe_load.regular_files import open_regular
 
 _SHOWN = 12  # lines of each list
+
+
 _BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
-_PICKLED = {name_of(kind) for kind in (VecNormalize, *_BUFFERS)}
+
+
+_PICKLED = {pickled_name(kind) for kind in (VecNormalize, *_BUFFERS)}
 
 
 def inspect(path: Path) -> tuple[list[str], bool]:
     """
     Describe a file without running, importing or unpickling anything of it.
 
-    :param path: the zip of a model, ``VecNormalize`` statistics, a replay buffer, or the folder of a run
+    :param path: the zip of a model, ``VecNormalize`` statistics, a replay buffer
     :return: lines for the screen, and whether it would be opened
     :raises ValueError: if it is none of these
     """
-    if path.is_dir():
-        return _inspect_run(path)
     with reading(str(path)), open_regular(path, MAX_REPLAY_BYTES) as (file, size):
         if zipfile.is_zipfile(file):
             lines = _describe_model(path, size)
@@ -90,39 +89,3 @@ def _describe_pickle(path: Path, size: int) -> tuple[list[str], bool]:
     )
     lines = [f"{escaped(str(path))}: a pickle of {kind}, {size:,} bytes", "Names in it that are not read here:"]
     return [*lines, *(f"  {name}" for name in foreign[:_SHOWN] or ["none"]), verdict], is_known
-
-
-def _inspect_run(path: Path) -> tuple[list[str], bool]:
-    from sb3_tdc.run_folder import RunFolder
-    from sb3_tdc.safe_load.run_files import check_arguments, check_imports
-
-    run = RunFolder.open(path)
-    lines, is_good = [f"{escaped(str(path))}: the folder of a run"], True
-    try:
-        check_arguments(run.args, {str(run.args.get("algo"))}, str(path))
-        check_imports(run.args, run.config, (), str(path))
-        lines.append(f"  {escaped(json.dumps({name: run.args[name] for name in ('algo', 'env', 'gym_packages')}))}")
-    except ValueError as error:
-        lines, is_good = [*lines, f"Refused: {escaped(str(error))}"], False
-    for model in [model for model in (run.model, run.best_model) if model.exists()]:
-        described, opens = inspect(model)
-        lines, is_good = [*lines, "", *described], is_good and opens
-    return lines, is_good
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    :param argv: arguments, those of the process by default
-    :return: 0 if all would be opened, 1 if something is refused, 2 if it is no such file
-    """
-    arguments: list[Any] = list(sys.argv[1:] if argv is None else argv)
-    if len(arguments) != 1:
-        print("usage: python -m sb3_tdc.safe_load FILE_OR_RUN_FOLDER", file=sys.stderr)
-        return 2
-    try:
-        lines, is_good = inspect(Path(arguments[0]))
-    except (OSError, ValueError) as error:
-        print(f"error: {escaped(str(error))}", file=sys.stderr)
-        return 2
-    print("\n".join(lines))
-    return 0 if is_good else 1

@@ -19,21 +19,21 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 
+from sb3_tdc.common.checks import check_integer, check_number
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
-from sb3_tdc.tdc.checks import check_integer, check_number
 
 MAX_DIMENSIONS = 8
 
 
-def name_of(cls: type) -> Name:
-    """:return: what a pickle calls a class"""
+def pickled_name(cls: type) -> Name:
+    """Return what a pickle calls a class."""
     return Name(cls.__module__, cls.__qualname__)
 
 
 # Each is called without arguments, or by the policy with its own
 CLASSES: dict[Name, type] = {
-    name_of(cls): cls
+    pickled_name(cls): cls
     for cls in (
         *(getattr(th.nn.modules.activation, name) for name in th.nn.modules.activation.__all__),
         *(th.optim.Adam, th.optim.AdamW, th.optim.Adamax, th.optim.NAdam, th.optim.RAdam, th.optim.RMSprop),
@@ -76,7 +76,7 @@ def _dtype(call: Call, make: Rebuild) -> np.dtype:
 
 
 def _array(raw: Any, dtype: Any, shape: Any, order: str, budget: Budget) -> np.ndarray:
-    """:return: (shape), writable; there must be as many bytes as it takes"""
+    """Return (shape), writable; there must be as many bytes as it takes."""
     sizes = shape if isinstance(shape, tuple) else ()
     whole = isinstance(shape, tuple) and all(type(size) is int and size >= 0 for size in sizes)
     if not isinstance(raw, (bytes, bytearray)) or not isinstance(dtype, np.dtype) or not whole:
@@ -216,7 +216,7 @@ def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
 _SB3 = "stable_baselines3.common"
 _ENUMS: dict[Name, type[Enum]] = {
     Name(f"{_SB3}.type_aliases", "TrainFrequencyUnit"): TrainFrequencyUnit,
-    name_of(GoalSelectionStrategy): GoalSelectionStrategy,
+    pickled_name(GoalSelectionStrategy): GoalSelectionStrategy,
 }
 
 
@@ -233,7 +233,7 @@ def _enum_of_name(call: Call, make: Rebuild) -> Enum:
 
 
 def _object(make: Callable[[Call, Rebuild], Any]) -> Handler:
-    """:return: of an object that is made without arguments, and given its attributes"""
+    """Return what it is: of an object that is made without arguments, and given its attributes."""
     return Handler(make, state=True)
 
 

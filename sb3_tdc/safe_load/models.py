@@ -10,19 +10,17 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdc.common.untrusted import shown
 from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
-from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, shown
-from sb3_tdc.safe_load.checks import reading
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.fields import (
     TEMPERATURE,
-    check_complete,
     check_replay_memory,
-    known_policies,
-    nearest_algorithm,
     parse_data,
     read_fields,
 )
-from sb3_tdc.safe_load.files import open_regular
+from sb3_tdc.safe_load.reading import reading
+from sb3_tdc.safe_load.regular_files import open_regular
 from sb3_tdc.safe_load.weights import check_optimizer, check_weights, read_tensors
 
 
@@ -35,11 +33,13 @@ def load_safely(
     **kwargs: Any,
 ) -> OffPolicyAlgorithm:
     """
-    What ``Algorithm.load`` does for TDC, MEOW, TD3, SAC, DDPG and TQC, without running anything that is in the file.
+    Do what ``Algorithm.load`` does, without running anything that is in the file.
 
-    The model predicts and goes on learning as the saved one. It differs in this: ``tensorboard_log`` is never the
+    It knows TDC, MEOW, AdvB-TD3, AdvB-SAC and AdvB-TDC, SB3's TD3, SAC and DDPG, and sb3-contrib's TQC.
+
+    The model predicts and continues to learn as the saved one. It differs in this: ``tensorboard_log`` is never the
     file's, the last observation and the statistics of the last episodes are not kept (an environment is reset when
-    learning begins), and a schedule or a class of your own is refused unless ``custom_objects`` replaces it.
+    learning begins), and a custom schedule or class is refused unless ``custom_objects`` replaces it.
 
     :param path: zip of a saved model, with or without its suffix
     :param env: the environment to run it on; None to only predict
@@ -62,16 +62,12 @@ def load_safely(
                 raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
         given = {**kwargs, **(custom_objects or {})}
         of_the_caller = {name: value for name, value in given.items() if name != "ent_coef"}
-        fields = read_fields(entries["data"], of_the_caller, budget)
+        fields, saved_by = read_fields(entries["data"], of_the_caller, budget)
         policy_class: Any = fields.get("policy_class")
-        saved_by = known_policies().get(policy_class) or nearest_algorithm(policy_class)
         new_temperature = "ent_coef" in given and given["ent_coef"] != fields.get("ent_coef")
         fields.update({name: given[name] for name in (*kwargs, "ent_coef") if name in given})
-        if saved_by is None:
-            raise UnsafeFileError("it has no policy_class of TDC, MEOW, TD3, SAC, DDPG or TQC")
         if algorithm is not None and not issubclass(algorithm, saved_by):
             raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
-        check_complete(fields, saved_by)
         del fields["policy_class"]
         algorithm = algorithm or saved_by
         tensors = {}
@@ -96,6 +92,8 @@ def load_safely(
 
 def read_data(path: str | Path) -> dict[str, Any]:
     """
+    Read the fields of a saved model as JSON.
+
     :return: the JSON of a saved model, as it stands there: nothing in it is checked, rebuilt or run
     :raises UnsafeFileError: if it is not the zip of a saved model
     """

@@ -1,4 +1,4 @@
-"""What lies pickled beside a model: normalisation statistics and replay buffers."""
+"""Safe readers for the pickles saved next to a model: ``VecNormalize`` statistics and replay buffers."""
 
 import mmap
 from collections.abc import Callable
@@ -12,12 +12,14 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_tdc.common.saved_fields import boolean, integer, number
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
-from sb3_tdc.safe_load.checks import boolean, integer, number, reading
-from sb3_tdc.safe_load.fields import MAX_ENVS, MAX_REPLAY_BYTES
-from sb3_tdc.safe_load.files import open_regular
+from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Rebuild, read_pickle
-from sb3_tdc.safe_load.known_objects import CALLS, name_of
+from sb3_tdc.safe_load.known_objects import CALLS, pickled_name
+from sb3_tdc.safe_load.reading import reading
+from sb3_tdc.safe_load.regular_files import open_regular
+from sb3_tdc.safe_load.sb3_fields import MAX_ENVS
 
 
 def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
@@ -68,16 +70,16 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
 
 
 def _read_object(path: str | Path, cls: type, read_state: Callable[[Call, Rebuild], dict[str, Any]]) -> dict[str, Any]:
-    """:return: what ``read_state`` takes from the one pickled object of a class that a file holds"""
+    """Return what ``read_state`` takes from the one pickled object of a class that a file holds."""
     with open_regular(path, MAX_REPLAY_BYTES) as (file, size):
         if size == 0:
             raise UnsafeFileError("it is empty")
         budget = Budget(size)
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             saved = read_pickle(content, budget)  # type: ignore[arg-type]  # a mapped file reads like a file
-    if not isinstance(saved, Call) or saved.function != name_of(cls):
+    if not isinstance(saved, Call) or saved.function != pickled_name(cls):
         raise UnsafeFileError(f"it does not hold a {cls.__name__}")
-    return Rebuild({}, {**CALLS, name_of(cls): Handler(read_state, state=True)}, budget)(saved)
+    return Rebuild({}, {**CALLS, pickled_name(cls): Handler(read_state, state=True)}, budget)(saved)
 
 
 def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:

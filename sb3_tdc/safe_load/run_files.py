@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from sb3_tdc.safe_load.budget import escaped, shown
+from sb3_tdc.common.untrusted import escaped, shown
 
 # Classes that write no file and start no process, by the module that they are in or below
 _WRAPPERS: dict[str, set[str]] = {
@@ -42,6 +42,8 @@ _ARGUMENTS: dict[str, tuple[type, ...]] = {
 
 def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where: str) -> None:
     """
+    Check the types of a run's arguments.
+
     :param args: of ``args.yml``
     :param where: its path, for the error
     :raises ValueError: if one that is needed is missing, or of another type
@@ -59,6 +61,8 @@ def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where:
 
 def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str], where: str) -> None:
     """
+    Check that the files of a run name no code but what is known or consented to.
+
     :param args: of ``args.yml``
     :param config: of ``config.yml``
     :param consented: packages and modules that the user has named

@@ -9,11 +9,12 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_tdc.common.checks import find_non_finite
+from sb3_tdc.common.untrusted import escaped, shown
 from sb3_tdc.safe_load.archives import read_archive
-from sb3_tdc.safe_load.budget import Budget, UnsafeFileError, escaped, shown
-from sb3_tdc.safe_load.checks import reading
+from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import PERSISTENT, Call, Handler, Name, Rebuild, read_pickle
-from sb3_tdc.tdc.checks import find_non_finite
+from sb3_tdc.safe_load.reading import reading
 
 _TENSOR_ENTRIES = re.compile(
     r"[\w.-]+/(data\.pkl|version|byteorder|\.format_version|\.storage_alignment|\.data/serialization_id|data/\d+)"
@@ -62,7 +63,7 @@ class _Tensors:
         self.storages: dict[str, th.Tensor] = {}
 
     def make(self, call: Call, make: Rebuild) -> th.Tensor:
-        """:return: the part of a storage that a call of ``_rebuild_tensor_v2`` describes"""
+        """Return the part of a storage that a call of ``_rebuild_tensor_v2`` describes."""
         storage, offset, shape, stride, requires_grad, hooks, *metadata = call.args
         flat = self._storage(storage)
         numbers = (offset, *shape, *stride) if isinstance(shape, tuple) and isinstance(stride, tuple) else (-1,)
@@ -79,7 +80,7 @@ class _Tensors:
         return flat[offset : offset + size].view(shape)
 
     def _storage(self, storage: Any) -> th.Tensor:
-        """:return: (size,), of its type"""
+        """Return (size,), of its type."""
         is_call = isinstance(storage, Call) and storage.function == PERSISTENT and storage.state is None
         if not is_call or not isinstance(storage.args, tuple) or len(storage.args) != 5:
             raise UnsafeFileError("a tensor without its storage")
@@ -138,7 +139,11 @@ def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weight
 
 
 def check_optimizer(optimizer: th.optim.Optimizer, saved: Any) -> None:
-    """:raises UnsafeFileError: unless the saved state is one that this optimizer has after some steps, or before any"""
+    """
+    Check the saved state of an optimizer.
+
+    :raises UnsafeFileError: unless the saved state is one that this optimizer has after some steps, or before any
+    """
     if not isinstance(saved, dict) or set(saved) != {"state", "param_groups"}:
         raise UnsafeFileError("it is not the state of an optimizer")
     groups, states = saved["param_groups"], saved["state"]
@@ -166,7 +171,7 @@ def check_optimizer(optimizer: th.optim.Optimizer, saved: Any) -> None:
 
 
 def _state_after_a_step(optimizer: th.optim.Optimizer) -> dict[str, Any]:
-    """:return: what this optimizer keeps of a parameter, for one of shape (2,)"""
+    """Return what this optimizer keeps of a parameter, for one of shape (2,)."""
     parameter = th.zeros(2, requires_grad=True)
     kind: Any = type(optimizer)
     taken = inspect.signature(kind).parameters
@@ -190,7 +195,7 @@ def _is_state(value: Any, expected: Any, shape: th.Size) -> bool:
 
 
 def _is_like(value: Any, fresh: Any) -> bool:
-    """Whether an option is of the kind that the optimizer has: a number for a number, true or false for these."""
+    """Return whether an option is of the kind that the optimizer has: a number, or true or false."""
     if isinstance(value, bool) or isinstance(fresh, bool):
         return isinstance(value, bool | None) and isinstance(fresh, bool | None)
     if isinstance(fresh, (int, float)):

@@ -3,22 +3,14 @@
 from functools import cache
 from types import ModuleType
 
+from sb3_tdc.common.versions import numba_version
+
 
 @cache
 def load_kernels() -> ModuleType | None:
-    """Return the module of compiled loops, or None without Numba (the extra ``[fast]``) or with its JIT disabled."""
-    try:
-        import numba
-    except ImportError:  # also where an installed Numba does not support the installed NumPy
-        return None
-    if numba.config.DISABLE_JIT:
+    """Return the module of compiled loops, or None where Numba cannot compile them."""
+    if numba_version() is None:
         return None
     from sb3_tdc.tdc import kernels
 
     return kernels
-
-
-def numba_version() -> str | None:
-    """Return the version of Numba that compiles the loops, or None where there are none."""
-    kernels = load_kernels()
-    return kernels.numba.__version__ if kernels is not None else None

@@ -85,6 +85,8 @@ def td_target(
 
 class Target(NamedTuple):
     """
+    The λ-LCB target of a minibatch.
+
     :param quantiles: (B, N), y_j (Eq. 7)
     :param mean: (B, C), of the target critics (Eq. 4)
     :param std: (B, C)
@@ -135,7 +137,7 @@ def _row_chunks(n_rows: int, pairs: int) -> list[slice]:
 
 class QuantileHuberGradient:
     """
-    :func:`quantile_huber_gradient` of two tensors that are kept, in closed passes over one small buffer.
+    Compute :func:`quantile_huber_gradient` of two preallocated tensors, in closed passes over one small buffer.
 
     With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the slope of ρ at z_k summed over the targets is
     ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c). Autograd through all pairs would take most of the time of an update.
@@ -162,7 +164,7 @@ class QuantileHuberGradient:
         ]
 
     def __call__(self, kappa: float) -> th.Tensor:
-        """:return: (C, B, N), overwritten by the next call"""
+        """Return (C, B, N), overwritten by the next call."""
         for y, z, delta, total, size in self.chunks:
             th.sub(y, z, out=delta)  # Eq. 8
             slope = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
@@ -209,7 +211,7 @@ class _QuantileHuberLoss(th.autograd.Function):
         rows, target_rows = current.flatten(0, 1), target.repeat_interleave(current.shape[1], dim=0)
         sums = th.empty_like(rows), th.empty_like(rows)
         chunks = _row_chunks(len(rows), rows.shape[1] * target.shape[1])
-        # Buffers that are kept: fresh ones of this size cost more than the arithmetic
+        # Preallocated: fresh buffers of this size cost more than the arithmetic
         distance, clamped = (rows.new_empty(chunks[0].stop, rows.shape[1], target.shape[1]) for _ in range(2))
         for chunk in chunks:
             y, z = target_rows[chunk, None, :], rows[chunk, :, None]

@@ -16,10 +16,11 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
 
-from sb3_tdc.tdc.checks import check_action_space, check_integer, check_number
-from sb3_tdc.tdc.compiled import numba_version
+from sb3_tdc.common.checks import check_action_space, check_integer, check_number
+from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
+from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
+from sb3_tdc.common.versions import numba_version
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
-from sb3_tdc.tdc.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -76,7 +77,7 @@ class TDC(CheckedOffPolicyAlgorithm):
     :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` from 0.1 on,
         a number fixes it
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
-    :param fused: the same update on static buffers, faster: None where it applies (plain ReLU networks, flat
+    :param fused: the same update on preallocated buffers, faster: None where it applies (plain ReLU networks, flat
         observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -95,6 +96,28 @@ class TDC(CheckedOffPolicyAlgorithm):
         "MultiInputPolicy": MultiInputPolicy,
     }
     schedules: ClassVar[tuple[str, ...]] = ("lam", "learning_rate", "qf_learning_rate")
+    saved_fields: ClassVar[dict[str, SavedField]] = {
+        "lam": SavedField(schedule),
+        "kappa": SavedField(number(0.0)),
+        "qf_learning_rate": SavedField(or_none(schedule)),
+        "stochastic_actor": SavedField(boolean),
+        "policy_delay": SavedField(integer(1)),
+        "target_policy_noise": SavedField(number(0.0)),
+        "target_noise_clip": SavedField(number(0.0)),
+        "ent_coef": SavedField(text_or_number),
+        "target_entropy": SavedField(text_or_number),
+        "fused": SavedField(or_none(boolean), is_required=False),
+        "_built_stochastic_actor": SavedField(boolean, is_required=False),
+        # Where there is a temperature, it is a tensor, and elsewhere in the file
+        "log_ent_coef": SavedField(none, is_required=False),
+        "ent_coef_optimizer": SavedField(none, is_required=False),
+        "ent_coef_tensor": SavedField(none, is_required=False),
+        "policy_kwargs.n_critics": SavedField(integer(1, 256), is_required=False),
+    }
+    changeable: ClassVar[tuple[str, ...]] = (
+        *("lam", "kappa", "qf_learning_rate", "policy_delay", "target_policy_noise", "target_noise_clip"),
+    )
+    color: ClassVar[str | None] = "#0072B2"
     policy: TDCPolicy
     replay_buffer: ReplayBuffer
 
@@ -216,10 +239,10 @@ class TDC(CheckedOffPolicyAlgorithm):
     def _learns_ent_coef(self) -> bool:
         return self.ent_coef_optimizer is not None
 
-    def _scheduled(self, name: str, progress_remaining: float | None = None) -> float:
+    def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
         if name == "qf_learning_rate" and self.qf_learning_rate is None:
             name = "learning_rate"
-        return super()._scheduled(name, progress_remaining)
+        return super().scheduled(name, progress_remaining)
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -276,7 +299,7 @@ class TDC(CheckedOffPolicyAlgorithm):
             return
         if isinstance(self.ent_coef, str) and self.ent_coef.startswith("auto"):
             self.log_ent_coef = initial.log().requires_grad_(True)
-            learning_rate = self._scheduled("learning_rate")
+            learning_rate = self.scheduled("learning_rate")
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=learning_rate, fused=True)
         else:
             self.ent_coef_tensor = initial
@@ -295,14 +318,14 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """
-        Algorithm 1, from the minibatch to the targets, ``gradient_steps`` times.
+        Do ``gradient_steps`` iterations of Algorithm 1, by :meth:`update` or its fused twin.
 
         :param gradient_steps: number of updates
         :param batch_size: B, transitions per update
         :raises ValueError: if a schedule returns something that is not allowed
         :raises NonFiniteError: if a loss has been seen to be NaN or infinite
         """
-        lam = self._scheduled("lam")
+        lam = self.scheduled("lam")
         self._renew_temperature()
         self._update_learning_rates()
         fused_update = self._bind_fused_update(batch_size)
@@ -312,19 +335,24 @@ class TDC(CheckedOffPolicyAlgorithm):
         for _ in range(gradient_steps):
             self._n_updates += 1
             if fused_update is None:
-                replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+                self.update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env), lam)
             else:
-                replay_data = fused_update.sample(batch_size)
-            # A replay buffer of the user's own may return another number of transitions than it was asked for
-            full = fused_update is not None and len(replay_data.rewards) == batch_size
-            update = fused_update if fused_update is not None and full else self
-            update.update_critics(replay_data, lam)
-            if self._n_updates % self.policy_delay == 0:
-                update.update_actor(replay_data)
-                update.update_targets()
+                fused_update.step(lam)  # the same
             if self._n_updates % FLUSH_INTERVAL == 0:
                 self._flush_moments()
         self._record_training()
+
+    def update(self, replay_data: ReplayBufferSamples, lam: float) -> None:
+        """
+        One iteration of Algorithm 1.
+
+        :param replay_data: a minibatch
+        :param lam: λ
+        """
+        self.update_critics(replay_data, lam)
+        if self._n_updates % self.policy_delay == 0:
+            self.update_actor(replay_data)
+            self.update_targets()
 
     def _flush_moments(self) -> None:
         """Set moments of Adam to zero that are about to become denormal numbers."""
@@ -336,9 +364,9 @@ class TDC(CheckedOffPolicyAlgorithm):
                 moment.masked_fill_(moment.abs() < SMALLEST_MOMENT, 0)
 
     def _update_learning_rates(self) -> None:
-        learning_rate = self._scheduled("learning_rate")
+        learning_rate = self.scheduled("learning_rate")
         update_learning_rate(self.actor.optimizer, learning_rate)  # type: ignore[arg-type]
-        update_learning_rate(self.critic.optimizer, self._scheduled("qf_learning_rate"))
+        update_learning_rate(self.critic.optimizer, self.scheduled("qf_learning_rate"))
         if self.ent_coef_optimizer is not None:
             update_learning_rate(self.ent_coef_optimizer, learning_rate)
 
@@ -407,7 +435,7 @@ class TDC(CheckedOffPolicyAlgorithm):
             self.diagnose(actor_loss=actor_loss.detach())
 
     def current_ent_coef(self) -> th.Tensor:
-        """:return: (1,), α"""
+        """Return (1,), α."""
         return self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
 
     def update_temperature(self, log_prob: th.Tensor, ent_coef: th.Tensor, actor_loss: th.Tensor) -> None:
@@ -448,17 +476,23 @@ class TDC(CheckedOffPolicyAlgorithm):
             for statistic, source in zip(*pairs, strict=True):
                 statistic.copy_(source)
 
+    def prepare_to_continue(self) -> None:
+        if self._n_updates > 0:
+            self._bind_fused_update(self.batch_size)  # it also chooses the actions
+
     # ---------------------------------------------------------------- logging
 
     @property
     def diagnoses_critics(self) -> bool:
-        """Whether this is an update at which the critics' diagnostics are taken."""
+        """Return whether this is an update at which the critics' diagnostics are taken."""
         return self._n_updates % DIAGNOSTICS_INTERVAL == 1
 
     def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
         """
+        Take the diagnostics of the critics into the log; each is described in docs/tdc.md.
+
         :param current: (B, C, N)
-        :param target: each figure is described in docs/tdc.md
+        :param target: of the same minibatch
         """
         y, mean, std, selected = target
         td_errors = y.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
@@ -563,7 +597,7 @@ def _parameters(networks: tuple[nn.Module, ...]) -> list[th.Tensor]:
 _FUSED_METHODS = {
     name: getattr(TDC, name)
     for name in (
-        *("train", "update_critics", "update_actor", "update_targets"),
+        *("train", "update", "update_critics", "update_actor", "update_targets"),
         *("_sample_target_actions", "_minimize", "predict"),
     )
 }

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc import load_safely
 from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
-from tests.tdc.test_update import OBS, TwoActions
+from tests.helpers.tdc import OBS, TwoActions
 
 ALGORITHMS = pytest.mark.parametrize("algorithm", [AdvBTD3, AdvBSAC, AdvBTDC])
 

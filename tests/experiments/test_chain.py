@@ -2,14 +2,16 @@
 
 import yaml
 
-from experiments import report, test_returns
-from experiments.results import find_runs
-from tests.experiments import test_run, test_tune
+from sb3_tdc.cli import evaluate, report
+from sb3_tdc.experiments.final_episodes import read_test_returns
+from sb3_tdc.experiments.results import find_runs
+from tests.helpers.matrices import finish, start_matrix
+from tests.helpers.searches import arguments, start_search
 
 
 def test_from_a_search_to_a_page(tmp_path, capsys):
-    options = test_tune.arguments(tmp_path, steps=100)
-    out, status = test_tune.finish(test_tune.start(*options, "--search", "lam:[0.0, 1.0]"))
+    options = arguments(tmp_path, steps=100)
+    out, status = finish(start_search(*options, "--search", "lam:[0.0, 1.0]"))
     assert status == 0, out
     search = tmp_path / "search/tdc/Pendulum-v1_1"
     ranking = (search / "ranking.csv").read_text().splitlines()
@@ -20,25 +22,25 @@ def test_from_a_search_to_a_page(tmp_path, capsys):
 
     matrix = tmp_path / "matrix"
     scale = ["--scale", "0.0003"]  # 300 steps
-    out, status = test_run.finish(test_run.start("fig2", matrix, *scale))
+    out, status = finish(start_matrix("fig2", matrix, *scale))
     assert status == 1, out  # one of the two fails, and does not stop the other
     assert "failed tdc Pendulum-v1" in out
     assert "lam must be" in out
     (run,), _ = find_runs(matrix)
     assert run.is_finished
-    out, status = test_run.finish(test_run.start("fig1", matrix, *scale, "--dry-run"))
+    out, status = finish(start_matrix("fig1", matrix, *scale, "--dry-run"))
     assert status == 0, out
     assert "skip   tdc Pendulum-v1" in out  # a cell of both suites is one run
     assert "1 of 2 to run" in out
     before = run.folder.model.stat().st_mtime_ns
-    out, status = test_run.finish(test_run.start("fig2", matrix, *scale))
+    out, status = finish(start_matrix("fig2", matrix, *scale))
     assert status == 1, out
     assert "1 of 2 runs are finished already" in out
     assert run.folder.model.stat().st_mtime_ns == before
 
-    assert test_returns.main([str(matrix), "--episodes", "2"]) == 0
+    assert evaluate.main([str(matrix), "--episodes", "2"]) == 0
     assert report.main([str(matrix), "-o", str(tmp_path / "report")]) == 0
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert "300 steps; bins of" in page
-    assert f"{test_returns.read_test_returns(run).mean():,.0f}".replace("-", "−") in page
+    assert f"{read_test_returns(run).mean():,.0f}".replace("-", "−") in page
     capsys.readouterr()

@@ -5,19 +5,21 @@ import shutil
 import numpy as np
 import pytest
 
-from experiments import publish, run, test_returns
-from experiments.results import find_runs
-from experiments.suites import SUITES, Cell
-from sb3_tdc import plain_yaml, train
+from sb3_tdc.cli import evaluate, matrix, publish, train
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.experiments import final_episodes, plan
+from sb3_tdc.experiments import publish as publishing
+from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.experiments.suites import SUITES, Cell
 
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     """A real run in its place in a matrix, with test episodes."""
     folder = tmp_path_factory.mktemp("logs")
-    (job,) = run.make_plan([Cell("tdc", "Pendulum-v1", SMALL, 600)], [3], 1.0, folder).jobs
+    (job,) = plan.make_plan([Cell("tdc", "Pendulum-v1", SMALL, 600)], [3], 1.0, folder).jobs
     assert train.main([*job.arguments, "--verbose", "0", "--log-interval", "1"]) == 0
-    assert test_returns.main([str(folder), "--episodes", "4"]) == 0
+    assert evaluate.main([str(folder), "--episodes", "4"]) == 0
     return folder
 
 
@@ -30,7 +32,7 @@ SMALL = {
 
 
 def test_the_published_run_says_what_the_run_says(logs, tmp_path, monkeypatch):
-    monkeypatch.setattr(publish, "_ROWS", 2)
+    monkeypatch.setattr(publishing, "_ROWS", 2)
     assert publish.main([str(logs), "-o", str(tmp_path)]) == 0
     ((before,), _), ((after,), unreadable) = find_runs(logs), find_runs(tmp_path)
     assert unreadable == []
@@ -39,7 +41,7 @@ def test_the_published_run_says_what_the_run_says(logs, tmp_path, monkeypatch):
     assert after.system == before.system
     assert "mujoco" in after.system
     assert np.array_equal(after.evaluations.returns, before.evaluations.returns)
-    assert np.array_equal(test_returns.read_test_returns(after), test_returns.read_test_returns(before))
+    assert np.array_equal(final_episodes.read_test_returns(after), final_episodes.read_test_returns(before))
     rows = before.progress("time/total_timesteps", "eval/mean_reward")
     assert len(rows) > 10
     assert after.progress("time/total_timesteps", "eval/mean_reward") == pytest.approx(rows, rel=1e-5)
@@ -63,8 +65,8 @@ def test_the_matrix_skips_what_is_published(logs, tmp_path, monkeypatch, capsys)
     monkeypatch.setitem(SUITES, "fig1", [Cell("tdc", "Pendulum-v1", SMALL, 600)])
     publish.main([str(logs), "-o", str(tmp_path / "results")])
     command = ["fig1", "--seeds", "3", "4", "--logs", str(tmp_path / "logs"), "--results", str(tmp_path / "results")]
-    monkeypatch.setattr(run, "measure_rate", lambda job: 100.0)
-    assert run.main([*command, "--dry-run"]) == 0
+    monkeypatch.setattr(plan, "measure_rate", lambda job: 100.0)
+    assert matrix.main([*command, "--dry-run"]) == 0
     out = capsys.readouterr().out
     assert f"1 of 2 runs are in {tmp_path / 'results'}" in out
     assert "1 of 1 to run" in out
@@ -82,6 +84,6 @@ def test_unfinished_runs_are_not_published(logs, tmp_path):
 def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
     copy = tmp_path / "logs"
     shutil.copytree(logs, copy)
-    next(copy.rglob(test_returns.FILE)).unlink()
+    next(copy.rglob(final_episodes.FILE)).unlink()
     assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 1
     assert "Without test episodes" in capsys.readouterr().out

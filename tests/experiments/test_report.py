@@ -8,11 +8,13 @@ import pytest
 import yaml
 from matplotlib import figure
 
-from experiments import figures, provenance, report, tables, test_returns
-from experiments.results import Run, find_runs, group_runs
-from sb3_tdc import train
-from sb3_tdc.experiment import ALGORITHMS
-from tests.experiments.test_results import make_run
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.cli import evaluate, train
+from sb3_tdc.cli import report as report_command
+from sb3_tdc.experiments import curves, figures, final_episodes, provenance, report, sections, tables
+from sb3_tdc.experiments.results import Run, find_runs, group_runs
+from sb3_tdc.runs.trained import TrainedModel
+from tests.helpers.run_folders import make_run
 
 
 def read_groups(folder):
@@ -123,7 +125,7 @@ def test_long_labels_leave_the_axes_their_room():
 def test_the_caption_has_the_whole_label(tmp_path):
     make_run(tmp_path, seed=1)
     groups, labels = read_groups(tmp_path), [LONG]
-    picture = report.Report(groups, tmp_path).draw_learning_curves("name", groups, labels, ["blue"])
+    picture = sections.Report(groups, tmp_path).draw_learning_curves("name", groups, labels, ["blue"])
     assert f"{LONG}: 1 (1)" in picture.caption
 
 
@@ -131,7 +133,7 @@ def test_bins_scale_with_the_run_but_hold_an_evaluation(tmp_path):
     def width(**kwargs):
         make_run(tmp_path / str(kwargs), **kwargs)
         (group,) = read_groups(tmp_path / str(kwargs))
-        return report.bin_width(group)
+        return curves.bin_width(group)
 
     assert width(n_timesteps=1_500_000, args={"eval_freq": 20_000}) == 20_000
     assert width(n_timesteps=1_500_000, args={"eval_freq": 5_000}) == 20_000
@@ -146,7 +148,7 @@ def test_scores_over_tasks_need_two_seeds_of_everything(tmp_path):
             make_run(tmp_path, env_id=env_id, seed=seed, returns=((10.0 * seed,),), lam=1.0)
             make_run(tmp_path, algo="sac", env_id=env_id, seed=seed, returns=((10.0 * seed - 10,),))
     make_run(tmp_path, algo="td3", seed=1)  # one seed: not among them
-    found = report.Report(read_groups(tmp_path), tmp_path).scores()
+    found = sections.Report(read_groups(tmp_path), tmp_path).scores()
     assert set(found) == {"TDC", "SAC"}
     # Returns 10 and 20 against 0 and 10
     assert [scores.tolist() for scores in found["TDC"]] == [[0.5, 1], [0.5, 1]]
@@ -172,12 +174,12 @@ def test_what_is_missing_is_said(tmp_path, monkeypatch):
 
 
 def test_bad_arguments_are_one_sentence(tmp_path, capsys):
-    for main in (report.main, test_returns.main):
+    for main in (report_command.main, evaluate.main):
         with pytest.raises(SystemExit):
             main([str(tmp_path)])
         assert "There are no runs in" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        test_returns.main([str(tmp_path), "--episodes", "0"])
+        evaluate.main([str(tmp_path), "--episodes", "0"])
     assert "--episodes must be at least 1" in capsys.readouterr().err
 
 
@@ -194,22 +196,22 @@ def logs(tmp_path_factory):
 
 
 def test_returns_are_kept_until_the_model_changes(logs, capsys, monkeypatch):
-    assert test_returns.main([str(logs), "--episodes", "4"]) == 0
+    assert evaluate.main([str(logs), "--episodes", "4"]) == 0
     assert capsys.readouterr().out.count("(4 episodes)") == 6
     run = find_runs(logs)[0][0]
-    returns = test_returns.read_test_returns(run)
+    returns = final_episodes.read_test_returns(run)
     assert len(returns) == 4
     assert len(set(returns)) == 4
     with monkeypatch.context() as patch:
-        patch.setattr(test_returns, "play_episodes", None)  # nothing is played again
-        assert test_returns.measure_run(run, 3).tolist() == returns[:3].tolist()
-    assert test_returns.measure_run(run, 6)[:4].tolist() == returns.tolist()  # the seeds decide, one by one
+        patch.setattr(final_episodes, "play_final_episodes", None)  # nothing is played again
+        assert final_episodes.measure_run(run, 3).tolist() == returns[:3].tolist()
+    assert final_episodes.measure_run(run, 6)[:4].tolist() == returns.tolist()  # the seeds decide, one by one
     model = run.folder.model.read_bytes()
     other = next(r for r in find_runs(logs)[0] if r.algo == run.algo and r.folder != run.folder)
     run.folder.model.write_bytes(other.folder.model.read_bytes())
-    assert test_returns.read_test_returns(run) is None
+    assert final_episodes.read_test_returns(run) is None
     run.folder.model.write_bytes(model)
-    assert test_returns.read_test_returns(run) is not None
+    assert final_episodes.read_test_returns(run) is not None
 
 
 def test_a_run_that_cannot_be_tested_does_not_stop_the_others(logs, capsys, monkeypatch):
@@ -218,8 +220,8 @@ def test_a_run_that_cannot_be_tested_does_not_stop_the_others(logs, capsys, monk
             raise RuntimeError("no such luck")
         return np.zeros(episodes)
 
-    monkeypatch.setattr(test_returns, "play_episodes", fail_for_td3)
-    assert test_returns.main([str(logs), "--episodes", "7"]) == 1
+    monkeypatch.setattr(final_episodes, "play_final_episodes", fail_for_td3)
+    assert evaluate.main([str(logs), "--episodes", "7"]) == 1
     captured = capsys.readouterr()
     assert captured.err.count("RuntimeError: no such luck") == 2
     assert captured.out.count("(7 episodes)") == 4
@@ -228,21 +230,20 @@ def test_a_run_that_cannot_be_tested_does_not_stop_the_others(logs, capsys, monk
 def test_a_run_of_another_package_needs_its_name(tmp_path, monkeypatch):
     code = "import gymnasium as gym\ngym.register('Elsewhere-v0', gym.spec('Pendulum-v1').entry_point)\n"
     (tmp_path / "elsewhere_package.py").write_text(code)
-    folder = make_run(tmp_path, env_id="Elsewhere-v0", args={"gym_packages": ["elsewhere_package"]})
+    folder = make_run(tmp_path, env_id="Elsewhere-v0", args={"gym_packages": ["elsewhere_package"], "env_kwargs": {}})
     run = Run.open(folder.path)
     with pytest.raises(ValueError, match=r"asks for the package elsewhere_package: .*--gym-packages elsewhere_package"):
-        test_returns.measure_run(run)
+        final_episodes.measure_run(run)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(test_returns, "load_safely", lambda *args, **kwargs: None)
-    monkeypatch.setattr(test_returns, "play_episodes", lambda model, env, episodes: np.ones(episodes))
-    run.folder.write_config(run.folder.config, {**run.folder.args, "env_kwargs": {}, "eval_env_kwargs": {}})
-    assert test_returns.measure_run(run, 3, ["elsewhere_package"]).tolist() == [1, 1, 1]
+    monkeypatch.setattr(TrainedModel, "load", lambda *args: None)
+    monkeypatch.setattr(final_episodes, "play_final_episodes", lambda model, env, episodes: np.ones(episodes))
+    assert final_episodes.measure_run(run, 3, ["elsewhere_package"]).tolist() == [1, 1, 1]
 
 
 def test_from_runs_to_a_page(logs, tmp_path, capsys):
     for run in find_runs(logs)[0]:
-        test_returns.measure_run(run, 2)
-    assert report.main([str(logs), "-o", str(tmp_path)]) == 0
+        final_episodes.measure_run(run, 2)
+    assert report_command.main([str(logs), "-o", str(tmp_path)]) == 0
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"""(src|href)=["'](?!data:|#)""", page)  # nothing from elsewhere
     assert "url(" not in page

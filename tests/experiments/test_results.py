@@ -1,37 +1,11 @@
 """Folders of runs → groups that may be averaged."""
 
-import json
-import zipfile
-
 import numpy as np
 import pytest
 
-from experiments.results import describe, differences, find_runs, group_runs, vary
-from experiments.suites import SUITES, Cell
-from sb3_tdc.run_folder import RunFolder
-
-NETWORKS = {"net_arch": [256, 256], "n_quantiles": 64}
-HOPPER = {
-    "lam": 0.9,
-    "learning_rate": 2e-4,
-    "qf_learning_rate": 2e-4,
-    "policy_kwargs": NETWORKS,
-    "n_timesteps": 1000,
-}
-
-
-def make_run(folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=(), returns=((1.0, 3.0),), **config):
-    """:param steps: taken; None if no model was saved"""
-    run = RunFolder.create(folder, algo, env_id)
-    config = {**(HOPPER if algo == "tdc" else {"n_timesteps": 1000}), **config}
-    run.write_config(config, {"algo": algo, "env": env_id, "seed": seed, **dict(args)})
-    timesteps = np.linspace(0, steps or 500, len(returns) + 1)[1:]
-    np.savez(run.path / "evaluations.npz", timesteps=timesteps, results=returns)
-    if steps is not None:
-        with zipfile.ZipFile(run.model, "w") as archive:
-            archive.writestr("data", json.dumps({"num_timesteps": steps}))
-            archive.writestr("system_info.txt", "- OS: of the test\n- Python: 3\n")
-    return run
+from sb3_tdc.experiments.results import describe, differences, find_runs, group_runs, vary
+from sb3_tdc.experiments.suites import SUITES, Cell
+from tests.helpers.run_folders import NETWORKS, make_run
 
 
 def labels(folder):
@@ -147,7 +121,7 @@ def test_a_damaged_file_is_listed_and_the_others_are_read(tmp_path, name, damage
 
 def test_a_run_that_a_callback_ended_is_finished_for_all(tmp_path):
     """``train.py`` marks its runs; how many steps they have does not matter then."""
-    folder = make_run(tmp_path, steps=400, args={"checkpoint_freq": 100})
+    folder = make_run(tmp_path, steps=400, args={"resume_freq": 100})
     assert not find_runs(tmp_path)[0][0].is_finished
     folder.mark_finished(400)
     (run,), _ = find_runs(tmp_path)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from experiments import statistics as s
+from sb3_tdc.experiments import statistics as s
 
 RETURNS = st.floats(-1e4, 1e4).map(lambda x: round(x, 3))
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tdc import MEOW, NonFiniteError, UnsafeFileError, load_safely
-from tests.tdc.test_update import TwoActions
+from tests.helpers.tdc import TwoActions
 
 TINY = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
 SMALL_NETWORKS = {"net_arch": [8, 8], "shift_arch": [8, 8]}

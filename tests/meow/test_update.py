@@ -12,8 +12,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_tdc import MEOW, NonFiniteError
-from tests.meow import reference
-from tests.tdc.test_update import ACT, BATCH, OBS, BatchQueue, TwoActions, random_batches
+from tests.helpers import meow_reference as reference
+from tests.helpers.tdc import ACT, BATCH, OBS, BatchQueue, TwoActions, random_batches
 
 LOW, HIGH = -4.0, 1.0
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.saved_models import MODELS
 from tests.safe_load.attacks import ATTACKS
-from tests.safe_load.test_safe_load import MODELS
 
 ROOT = Path(__file__).parents[2]
 

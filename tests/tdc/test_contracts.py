@@ -25,10 +25,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn
 
 from sb3_tdc import TDC, NonFiniteError, load_safely
+from sb3_tdc.common.checks import find_non_finite
 from sb3_tdc.safe_load import UnsafeFileError
-from sb3_tdc.tdc.checks import find_non_finite
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
-from tests.tdc.test_update import TwoActions
+from tests.helpers.tdc import TwoActions
 
 HEADS = pytest.mark.parametrize("stochastic_actor", [False, True], ids=["deterministic", "stochastic"])
 FUSED = pytest.mark.parametrize("fused", [False, None], ids=["readable", "fused"])

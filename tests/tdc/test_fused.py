@@ -12,26 +12,24 @@ from torch import nn
 
 from sb3_tdc import TDC
 from sb3_tdc.tdc.fused import FusedUpdate
-from tests.tdc.test_tdc import HEADS, SMALL, BatchNormExtractor, assert_same_weights, make, weights
-from tests.tdc.test_update import BATCH, BatchQueue, TwoActions, make_model, random_batches
+from tests.helpers.tdc import (
+    BATCH,
+    HEADS,
+    SMALL,
+    BatchNormExtractor,
+    BatchQueue,
+    TwoActions,
+    assert_close,
+    assert_same_weights,
+    make,
+    make_model,
+    random_batches,
+    states,
+    weights,
+)
 
 # Every test with the compiled loops, and with PyTorch's in their place
 pytestmark = pytest.mark.usefixtures("loops")
-
-
-def states(model):
-    """Weights of all networks and all state of the optimizers, as a flat dict of float64 tensors."""
-    found = {f"policy.{name}": weight for name, weight in model.policy.state_dict().items()}
-    for name in ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer"):
-        for i, state in model.get_parameters().get(name, {"state": {}})["state"].items():
-            found.update({f"{name}.{i}.{key}": value for key, value in state.items()})
-    return {name: value.detach().double().clone() for name, value in found.items()}
-
-
-def assert_close(a, b, rtol, atol):
-    assert a.keys() == b.keys()
-    for name in a:
-        th.testing.assert_close(a[name], b[name], rtol=rtol, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
 
 
 @HEADS

@@ -7,9 +7,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from sb3_tdc.tdc.fused.graphs import CudaGraphs
-from tests.tdc.test_fused import assert_close, states
-from tests.tdc.test_tdc import HEADS, make
-from tests.tdc.test_update import BatchQueue, TwoActions, make_model, random_batches
+from tests.helpers.tdc import HEADS, BatchQueue, TwoActions, assert_close, make, make_model, random_batches, states
 
 pytestmark = pytest.mark.usefixtures("torch_loops")  # as on a GPU
 WAITS = {th.ops.aten._local_scalar_dense.default, th.ops.aten.nonzero.default, th.ops.aten.equal.default}

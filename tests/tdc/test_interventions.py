@@ -17,9 +17,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from sb3_tdc import TDC
 from sb3_tdc.tdc.fused.replay import PackedReplay
 from sb3_tdc.tdc.policies import TanhGaussian
-from tests.tdc.test_fused import assert_close, states
-from tests.tdc.test_tdc import HEADS, make
-from tests.tdc.test_update import ACT, BatchQueue, TwoActions, make_model, random_batches
+from tests.helpers.tdc import ACT, HEADS, BatchQueue, TwoActions, assert_close, make, make_model, random_batches, states
 
 CALLS: list[str] = []
 

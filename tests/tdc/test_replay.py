@@ -12,9 +12,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc.tdc.fused.replay import PackedReplay
-from tests.tdc.test_fused import assert_close, states
-from tests.tdc.test_tdc import HEADS, make
-from tests.tdc.test_update import TwoActions
+from tests.helpers.tdc import HEADS, TwoActions, assert_close, make, states
 
 
 def add_steps(buffers, count, rng):

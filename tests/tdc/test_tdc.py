@@ -14,7 +14,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from torch import nn
@@ -23,35 +22,7 @@ from sb3_tdc import TDC, NonFiniteError
 from sb3_tdc.tdc import MlpPolicy
 from sb3_tdc.tdc.quantiles import Target
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
-from tests.tdc.test_update import TwoActions
-
-SMALL = {"net_arch": [16, 16], "n_quantiles": 5}
-HEADS = pytest.mark.parametrize("stochastic_actor", [False, True], ids=["deterministic", "stochastic"])
-
-
-def make(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
-    policy_kwargs = {**SMALL, **kwargs.pop("policy_kwargs", {})}
-    defaults = {"learning_starts": 40, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
-    return TDC(policy, env, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
-
-
-def weights(model):
-    return {name: weight.clone() for name, weight in model.policy.state_dict().items()}
-
-
-def assert_same_weights(a, b, but=()):
-    for name, weight in a.items():
-        assert th.equal(weight, b[name]) or name in but, name
-
-
-class BatchNormExtractor(BaseFeaturesExtractor):
-    def __init__(self, observation_space):
-        super().__init__(observation_space, observation_space.shape[0])
-        self.net = nn.Sequential(nn.Flatten(), nn.BatchNorm1d(self.features_dim))
-
-    def forward(self, observations):
-        return self.net(observations)
-
+from tests.helpers.tdc import HEADS, BatchNormExtractor, TwoActions, assert_same_weights, make, weights
 
 # ---------------------------------------------------------------- where it must work
 
@@ -295,7 +266,7 @@ def test_a_schedule_survives_saving(tmp_path):
     make(lam=LinearSchedule(1.0, 0.5, 1.0)).save(tmp_path / "model")
     loaded = TDC.load(tmp_path / "model")
     loaded._current_progress_remaining = 0.5
-    assert loaded._scheduled("lam") == pytest.approx(0.75)
+    assert loaded.scheduled("lam") == pytest.approx(0.75)
 
 
 # ---------------------------------------------------------------- logging

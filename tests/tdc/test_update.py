@@ -2,67 +2,14 @@
 
 import copy
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_tdc import TDC
-from tests.tdc.reference import Reference
-
-OBS, ACT, BATCH = 3, 2, 5
-
-
-class TwoActions(gym.Env):
-    """Observations in R³, two actions in [-0.4, 2]: unequal bounds, so that scaling mistakes show."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (OBS,), np.float32)
-    action_space = gym.spaces.Box(-0.4, 2.0, (ACT,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        self.episode = getattr(self, "episode", -1) + 1
-        return self.np_random.normal(size=OBS).astype(np.float32), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action)
-        self.t += 1
-        reward = -float(np.square(action).sum())
-        timeout, terminal = (self.t == 5, False) if self.episode % 2 == 0 else (False, self.t == 7)
-        return self.np_random.normal(size=OBS).astype(np.float32), reward, terminal, timeout, {}
-
-
-def make_model(**kwargs):
-    policy_kwargs = {"net_arch": [32, 24], "n_quantiles": 4, **kwargs.pop("policy_kwargs", {})}
-    return TDC("MlpPolicy", TwoActions(), policy_kwargs=policy_kwargs, seed=3, buffer_size=500, device="cpu", **kwargs)
-
-
-def random_batches(n, seed=0, batch=BATCH):
-    rng = np.random.default_rng(seed)
-    for _ in range(n):
-        yield [
-            th.tensor(x, dtype=th.float32)
-            for x in (
-                rng.normal(size=(batch, OBS)),
-                rng.uniform(-1, 1, (batch, ACT)),
-                rng.normal(size=(batch, OBS)),
-                (rng.random((batch, 1)) < 0.3).astype(float),
-                rng.normal(size=(batch, 1)) * 3,
-            )
-        ]
-
-
-class BatchQueue:
-    """Stands in for the replay buffer: gives the batches of the test, in order."""
-
-    def __init__(self, batches):
-        self.batches = iter(batches)
-
-    def sample(self, batch_size, env=None):
-        return ReplayBufferSamples(*next(self.batches))
+from tests.helpers.tdc import BATCH, BatchQueue, make_model, random_batches
+from tests.helpers.tdc_reference import Reference
 
 
 def double(module):

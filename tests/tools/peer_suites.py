@@ -32,7 +32,7 @@ _PEERS: dict[str, dict[str, Any]] = {
 
 # Why tests are unfair to TDC, and which (file::test, a regular expression)
 _UNFAIR = {
-    "asks for gSDE (use_sde), which TDC does not have": (
+    "requires gSDE (use_sde), which TDC does not have": (
         r"test_sde\.py::.*|test_run\.py::test_sde\[.*|test_spaces\.py::test_sde_multi_dim"
         r"|test_her\.py::test_save_load\[True-SAC\]|test_run\.py::test_offpolicy_multi_env\[SAC\]"
         r"|test_save_load\.py::test_save_load_policy\[True-.*-SAC\]"

@@ -5,6 +5,14 @@ What is computed is ``TDC.update_critics``, ``TDC.update_actor`` and ``TDC.updat
 same random numbers; the backward passes are derived by hand. Parameters, targets and the state of the optimizers stay
 where they are, and the policy is everyone's as before. As soon as anything is not as it was when the update was bound
 (``snapshot.py``), it is examined again (``applicability.py``), and the readable update takes over where it must.
+
+One transition is one row of a packed replay buffer and of the minibatch. Who reads which columns::
+
+    s | a | s' | r | d | t
+    └─┬─┘   │    └───┬───┘
+      │     │        target: r, and d − t (the end of an episode that is not that of its time limit)
+      │     copied next to ã into [s' | ã]: target actor (s'), target critics (both)
+      online critics (both); actor (s), which then writes its actions over a
 """
 
 from sb3_tdc.tdc.fused.applicability import obstacles

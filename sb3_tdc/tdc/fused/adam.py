@@ -55,7 +55,7 @@ class AdamStep:
         )
 
     def show_gradients(self) -> None:
-        """Let each parameter's ``grad`` be its gradient again, if somebody has set it to None."""
+        """Let each parameter's ``grad`` be its gradient again, if it has been set to None."""
         if self.parameters[0].grad is not self.gradients[0]:
             for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
                 parameter.grad = gradient

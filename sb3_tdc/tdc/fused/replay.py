@@ -7,12 +7,12 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
 _ARRAYS = ("observations", "actions", "next_observations", "rewards", "dones", "timeouts")
-# What is not done here if somebody has put another in the place of SB3's
+# The methods of SB3 that this replaces: if a user has replaced them, it does not apply
 _METHODS = {name: getattr(ReplayBuffer, name) for name in ("sample", "_get_samples")}
 
 
 def row_widths(obs_dim: int, action_dim: int) -> list[int]:
-    """:return: how many columns of a row belong to s, a, s', r, d, t"""
+    """Return how many columns of a row belong to s, a, s', r, d, t."""
     return [obs_dim, action_dim, obs_dim, 1, 1, 1]
 
 
@@ -21,7 +21,7 @@ class PackedReplay:
     The transitions of a ``ReplayBuffer`` as float32 rows [s | a | s' | r | d | t], so that a minibatch is one
     ``index_select``, not a walk through six arrays.
 
-    The arrays of the buffer become views of the rows: what anyone adds, changes or saves there is what is drawn here.
+    The arrays of the buffer become views of the rows: what is added, changed or saved there is what is drawn here.
     On CUDA the rows are copied to the device; those that the buffer has got since, when a minibatch is drawn. There,
     what is changed in the buffer afterwards is not seen.
 
@@ -62,7 +62,7 @@ class PackedReplay:
     def applies(buffer: ReplayBuffer) -> bool:
         """
         Return whether ``sample`` of this buffer is SB3's plain one, of flat observations of real numbers in arrays that
-        nobody else writes to or keeps: not in a file, in shared memory, or parts of others.
+        nobody else writes to or keeps: not in a file, in shared memory, or parts of other arrays.
         """
         return (
             type(buffer) is ReplayBuffer
@@ -74,7 +74,7 @@ class PackedReplay:
         )
 
     def holds(self, buffer: ReplayBuffer) -> bool:
-        """:return: whether this is the buffer, SB3 still samples it, and its arrays are still parts of the rows"""
+        """Return whether this is the buffer, SB3 still samples it, and its arrays are still parts of the rows."""
         return (
             self.buffer is buffer
             and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)

@@ -1,7 +1,7 @@
-"""One gradient step on static buffers. Shapes: C critics, B transitions, N quantiles, D observation, A action."""
+"""One gradient step on preallocated buffers. Shapes: C critics, B transitions, N quantiles, D observation, A action."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -19,10 +19,6 @@ from sb3_tdc.tdc.fused.scalar import Scalar
 from sb3_tdc.tdc.fused.snapshot import ModuleSnapshot, Snapshot
 from sb3_tdc.tdc.quantiles import Target
 
-if TYPE_CHECKING:
-    from sb3_tdc.tdc.tdc import TDC
-
-
 _COLUMNS = ("observations", "actions", "next_observations", "dones", "rewards")
 
 
@@ -32,15 +28,15 @@ def _call(function: Callable[[], Any]) -> Any:
 
 class FusedUpdate:
     """
-    The parts of one gradient step of a :class:`~sb3_tdc.tdc.tdc.TDC`, on static buffers.
+    One gradient step of TDC on preallocated buffers: the readable one is ``TDC.update``.
 
     On CUDA each part is one graph, and the batch comes from a copy of the replay buffer on the device.
 
-    :param model: for which :func:`obstacles` found nothing; its parameters become views
+    :param model: a ``TDC`` for which :func:`obstacles` found nothing; its parameters become views
     :param batch_size: B
     """
 
-    def __init__(self, model: "TDC", batch_size: int):
+    def __init__(self, model: Any, batch_size: int):
         self.model, self.batch_size = model, batch_size
         self.critic_adam = AdamStep(model.critic, model.critic_target)
         self.actor_adam = AdamStep(model.actor, model.actor_target)
@@ -130,12 +126,24 @@ class FusedUpdate:
     def __reduce__(self) -> tuple[Any, ...]:
         return type(None), ()  # and so does one that was pickled
 
-    def sample(self, batch_size: int) -> ReplayBufferSamples:
-        """:return: a minibatch of the model's replay buffer; of a packed one, overwritten by the next"""
+    def step(self, lam: float) -> None:
+        """``TDC.update``, on a minibatch of the model's replay buffer"""
+        model = self.model
+        replay_data = self.sample()
+        if len(replay_data.rewards) != self.batch_size:  # a custom replay buffer may return fewer than it was asked for
+            model.update(replay_data, lam)
+            return
+        self.update_critics(replay_data, lam)
+        if model._n_updates % model.policy_delay == 0:
+            self.update_actor()
+            self.update_targets()
+
+    def sample(self) -> ReplayBufferSamples:
+        """Return a minibatch of the model's replay buffer; of a packed one, the next overwrites it."""
         model, packed = self.model, self._find_packed_replay()
         if packed is None:
-            return model.replay_buffer.sample(batch_size, env=model._vec_normalize_env)
-        self.gather(packed.draw(batch_size, model.num_timesteps // model.n_envs))
+            return model.replay_buffer.sample(self.batch_size, env=model._vec_normalize_env)
+        self.gather(packed.draw(self.batch_size, model.num_timesteps // model.n_envs))
         return self.minibatch
 
     def _find_packed_replay(self) -> PackedReplay | None:
@@ -161,6 +169,8 @@ class FusedUpdate:
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
+        Compute the mean actions, as ``policy.predict`` does.
+
         :param observations: (n, D)
         :return: (n, A), the mean actions in [-1, 1]
         """
@@ -211,7 +221,7 @@ class FusedUpdate:
             self.noise.normal_(0, self.model.target_policy_noise)
             self.smooth(self.model.target_noise_clip)  # Eq. 1
 
-    def update_actor(self, replay_data: ReplayBufferSamples) -> None:
+    def update_actor(self) -> None:
         """``TDC.update_actor``, on the observations of the critics' update"""
         model = self.model
         self.actor_adam.read_learning_rate()

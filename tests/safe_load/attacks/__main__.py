@@ -10,7 +10,8 @@ import time
 import warnings
 from pathlib import Path
 
-from sb3_tdc import enjoy, load_safely
+from sb3_tdc import load_safely
+from sb3_tdc.cli import enjoy
 from sb3_tdc.safe_load import load_replay_buffer
 from tests.safe_load.attacks import ATTACKS
 from tests.safe_load.attacks.buffers import make_model

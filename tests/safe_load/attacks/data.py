@@ -12,7 +12,7 @@ REQUIRED = (
 VALUES = {
     "gamma": (1e300, -0.1, 1.01, "0.99", None, True, [0.99]),
     "tau": (-7, 0, 1.5, "x"),
-    "kappa": (0, -1, 10**400),
+    "kappa": (-1, 10**400),
     "target_policy_noise": (-1, "x"),
     "batch_size": (0, 2.5, 2**80, True),
     "train_freq": (0, [1, "hour"], [1], "x"),

@@ -3,7 +3,7 @@
 import os
 import shutil
 
-from sb3_tdc.run_folder import RunFolder
+from sb3_tdc.runs.folder import RunFolder
 
 ARGS = {"algo": "tdc", "env": "Pendulum-v1", "gym_packages": [], "env_kwargs": {}, "seed": 1}
 

@@ -1,0 +1,54 @@
+"""``sb3-tdc COMMAND``, or ``python -m sb3_tdc COMMAND``."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from sb3_tdc.common.checks import suggest
+
+COMMANDS = {
+    "train": "train an agent, or resume a run",
+    "enjoy": "watch, record or explain a trained agent",
+    "plot": "draw the learning curves of runs",
+    "inspect": "show what a saved file holds, without running any of it",
+    "tune": "search hyperparameters",
+    "matrix": "train the runs of a figure of the paper, several at once",
+    "evaluate": "play test episodes with every finished run",
+    "report": "make one page of all runs in a folder",
+    "publish": "copy the small files of finished runs into a folder to commit",
+}
+_USAGE = "usage: sb3-tdc COMMAND [ARGUMENTS], or sb3-tdc COMMAND --help\n\n" + "\n".join(
+    f"  {name:10}{what}" for name, what in COMMANDS.items()
+)
+_STARTED_BY_OTHERS = ("job",)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    :param argv: its name and its arguments, those of the process by default
+    :return: its exit status
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    name = arguments.pop(0) if arguments else "--help"
+    if name in ("-h", "--help"):
+        print(_USAGE)
+        return 0
+    if name == "--version":
+        print(f"sb3-tdc {version('sb3-tdc')}")
+        return 0
+    if name not in (*COMMANDS, *_STARTED_BY_OTHERS):
+        print(f"sb3-tdc: error: unknown command {name!r}{suggest(name, COMMANDS)}\n{_USAGE}", file=sys.stderr)
+        return 2
+    try:
+        module = importlib.import_module(f"sb3_tdc.cli.{name}")
+    except ImportError as error:  # with the command that installs what is missing
+        print(f"sb3-tdc {name}: error: {error}", file=sys.stderr)
+        return 2
+    return module.main(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,43 @@
+"""``sb3-tdc evaluate LOGS``: test episodes of every finished run."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
+from sb3_tdc.experiments.results import find_runs
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Play test episodes with every finished run.
+
+    :param argv: arguments, those of the process by default
+    :return: 0, or 1 if a run could not be tested
+    """
+    parser = Parser("evaluate", "Play test episodes with every finished run; what has been played is not played again.")
+    parser.add_argument("logs", type=Path, help="folder of runs")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes for each run")
+    add_settings(parser, ["gym_packages"])
+    args = parser.parse_args(argv)
+    if args.episodes < 1:
+        parser.fail(ValueError(f"--episodes must be at least 1, got {args.episodes}"))
+    try:
+        runs, unreadable = find_runs(args.logs)
+    except ValueError as error:
+        parser.fail(error)
+    failed = list(unreadable)
+    for run in runs:
+        if not run.is_finished:
+            print(f"{run.folder.path}: left out, at step {run.steps:,} of {run.n_timesteps:,}")
+            continue
+        try:
+            returns = measure_run(run, args.episodes, args.gym_packages)
+        except Exception as error:  # one run must not stop the others
+            failed.append(f"{run.folder.path}: {type(error).__name__}: {' '.join(str(error).split())}")
+            continue
+        print(f"{run.folder.path}: {returns.mean():.1f} ± {returns.std():.1f} ({len(returns)} episodes)", flush=True)
+    for sentence in failed:
+        print(f"Failed: {sentence}", file=sys.stderr)
+    return int(bool(failed))

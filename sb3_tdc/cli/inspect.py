@@ -1,0 +1,52 @@
+"""``sb3-tdc inspect FILE``: what a saved file holds, what of it is code, and whether it would be opened."""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_tdc.cli.arguments import Parser
+from sb3_tdc.common.untrusted import escaped
+from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.safe_load.inspect import inspect
+from sb3_tdc.safe_load.run_files import check_arguments, check_imports
+
+
+def inspect_run(path: Path) -> tuple[list[str], bool]:
+    """
+    Describe the folder of a run, with its last and its best model.
+
+    :return: lines for the screen, and whether all of it would be opened
+    :raises ValueError: if it is not the folder of a run
+    """
+    run = RunFolder.open(path)
+    lines, is_good = [f"{escaped(str(path))}: the folder of a run"], True
+    try:
+        check_arguments(run.args, {str(run.args.get("algo"))}, str(path))
+        check_imports(run.args, run.config, (), str(path))
+        lines.append(f"  {escaped(json.dumps({name: run.args[name] for name in ('algo', 'env', 'gym_packages')}))}")
+    except ValueError as error:
+        lines, is_good = [*lines, f"Refused: {escaped(str(error))}"], False
+    for model in [model for model in (run.model, run.best_model) if model.exists()]:
+        described, opens = inspect(model)
+        lines, is_good = [*lines, "", *described], is_good and opens
+    return lines, is_good
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Show what a saved file holds.
+
+    :param argv: arguments, those of the process by default
+    :return: 0 if all would be opened, 1 if something is refused, 2 if it is no such file
+    """
+    parser = Parser("inspect", "Show what a saved file holds, what of it is code, and whether it would be opened.")
+    parser.add_argument("path", type=Path, help="zip of a model, VecNormalize statistics, replay buffer, or run folder")
+    path = parser.parse_args(argv).path
+    try:
+        lines, is_good = inspect_run(path) if path.is_dir() else inspect(path)
+    except (OSError, ValueError) as error:
+        print(f"error: {escaped(str(error))}", file=sys.stderr)
+        return 2
+    print("\n".join(lines))
+    return 0 if is_good else 1

@@ -1,0 +1,23 @@
+"""``sb3-tdc train`` for a process that the matrix or a search has started: it ends with its parent."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+from sb3_tdc.cli import train
+
+
+def main(argv: Sequence[str]) -> int:
+    """Return the exit status of ``sb3-tdc train``."""
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    sys.orig_argv = ["sb3-tdc", "train", *argv]  # what to type to do the same, for the run's command.txt
+    return train.main(argv)
+
+
+def _die_with_parent() -> None:
+    """The other end of the standard input is the parent's: it closes when the parent dies, however it does."""
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGKILL)

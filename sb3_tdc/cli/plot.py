@@ -1,0 +1,99 @@
+"""``python -m sb3_tdc.cli.plot RUN [RUN ...]``: learning curves of runs, from their evaluations."""
+
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_tdc.cli.arguments import Parser
+from sb3_tdc.common.files import check_writable
+from sb3_tdc.common.plots import import_figure, style_axes
+from sb3_tdc.runs.folder import RunFolder
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """
+    The evaluations of one run.
+
+    :param label: algorithm and seed
+    :param timesteps: (evaluations,)
+    :param returns: (evaluations, episodes)
+    """
+
+    label: str
+    env_id: str
+    timesteps: np.ndarray
+    returns: np.ndarray
+
+
+def load_curve(run: RunFolder) -> Evaluated:
+    """
+    Read the evaluations of a run.
+
+    :raises ValueError: if the run has no evaluations
+    """
+    path = run.path / "evaluations.npz"
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist: the run has not been evaluated yet")
+    args = run.args
+    try:
+        with np.load(path) as evaluations:
+            timesteps, returns = evaluations["timesteps"], evaluations["results"]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    return Evaluated(f"{args['algo']}, seed {args['seed']}", args["env"], timesteps, returns)
+
+
+def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
+    """
+    One line a run, the mean over the episodes of each evaluation; the episodes are the dots.
+
+    :param axes: of matplotlib
+    :param curves: of one environment
+    """
+    for curve in curves:
+        (line,) = axes.plot(curve.timesteps, curve.returns.mean(axis=1), label=curve.label)
+        steps = np.repeat(curve.timesteps, curve.returns.shape[1])
+        axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
+    episodes = ", ".join(sorted({str(curve.returns.shape[1]) for curve in curves}))
+    style_axes(axes, curves[0].env_id, "environment steps", f"return of {episodes} mean-action episodes")
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.legend(frameon=False)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Draw the learning curves of runs.
+
+    :param argv: arguments, those of the process by default
+    :return: 0
+    """
+    parser = Parser("plot", "Draw the learning curves of runs.")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs of one environment")
+    parser.add_argument("-o", "--output", type=Path, default=Path("curve.png"), help="file (.png, .svg, .pdf)")
+    args = parser.parse_args(argv)
+    try:
+        check_writable("-o", args.output)
+        curves = [load_curve(RunFolder.open(run)) for run in args.runs]
+        if len({curve.env_id for curve in curves}) > 1:
+            raise ValueError("The runs must be of one environment; draw one figure for each")
+    except ValueError as error:
+        parser.fail(error)
+    try:
+        figure_class = import_figure()
+    except ImportError as error:
+        parser.fail(error)
+
+    figure = figure_class(figsize=(7, 4), layout="constrained")
+    kinds = sorted(figure.canvas.get_supported_filetypes())
+    if args.output.suffix.removeprefix(".") not in kinds:
+        parser.fail(ValueError(f"-o {args.output}: the name must end in one of .{', .'.join(kinds)}"))
+    draw_curves(figure.subplots(), curves)
+    figure.savefig(args.output, dpi=150)
+    print(f"Wrote {args.output}")
+    return 0

@@ -1,0 +1,42 @@
+"""``sb3-tdc publish LOGS``: copy the small files of finished runs into a folder that can be committed."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_tdc.cli.arguments import Parser
+from sb3_tdc.common.commands import command
+from sb3_tdc.experiments import final_episodes as test_returns
+from sb3_tdc.experiments.publish import RESULTS, publish
+from sb3_tdc.experiments.results import find_runs
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Copy the small files of finished runs.
+
+    :param argv: arguments, those of the process by default
+    :return: 0, or 1 if a finished run has not played its test episodes
+    """
+    parser = Parser(
+        "publish", "Copy the small files of all finished runs: evaluations, settings, versions, test returns, the log."
+    )
+    parser.add_argument("logs", type=Path, help="folder of runs")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="folder to write to")
+    args = parser.parse_args(argv)
+    try:
+        runs, unreadable = find_runs(args.logs)
+    except ValueError as error:
+        parser.fail(error)
+    untested = []
+    for run in (run for run in runs if run.is_finished and run.evaluations is not None):
+        place = publish(run, args.logs, args.output)
+        size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+        print(f"{place}: {size / 1000:.0f} kB")
+        if test_returns.read_test_returns(run) is None:
+            untested.append(place)
+    for text in unreadable:
+        print(text, file=sys.stderr)
+    if untested:
+        print(f"Without test episodes: {', '.join(map(str, untested))} ({command('evaluate', args.logs)})")
+    return int(bool(untested))

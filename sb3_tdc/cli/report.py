@@ -1,0 +1,34 @@
+"""``sb3-tdc report LOGS``: one page on all runs in a folder."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_tdc.cli.arguments import Parser
+from sb3_tdc.common.files import check_writable
+from sb3_tdc.experiments.report import write_report
+from sb3_tdc.experiments.results import find_runs
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Make the report on a folder of runs.
+
+    :param argv: arguments, those of the process by default
+    :return: 0
+    """
+    parser = Parser("report", "Make one HTML page of all runs in a folder, with figures and tables next to it.")
+    parser.add_argument("logs", type=Path, help="folder of runs")
+    parser.add_argument("-o", "--output", type=Path, help="folder to write to (report/ in the folder of runs)")
+    args = parser.parse_args(argv)
+    try:
+        runs, unreadable = find_runs(args.logs)
+    except ValueError as error:
+        parser.fail(error)
+    folder = args.output or args.logs / "report"
+    try:
+        check_writable("-o", folder / "report.html")
+    except ValueError as error:
+        parser.fail(error)
+    path = write_report(runs, unreadable, folder)
+    print(f"Wrote {path}, with figures/ and tables/ next to it")
+    return 0

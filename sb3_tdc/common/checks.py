@@ -1,0 +1,99 @@
+"""One clear sentence for every bad argument: what it is, what it was, what is allowed."""
+
+import difflib
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from torch import nn
+
+
+def _allowed(kind: str, minimum: float, maximum: float) -> str:
+    if maximum < math.inf:
+        return f"{kind} between {minimum} and {maximum}"
+    return f"{kind} of at least {minimum}" if minimum > -math.inf else kind
+
+
+def _as_number(value: Any) -> float:
+    """Whatever ``float()`` takes, for instance an array of one number, but no text and no truth value; else NaN."""
+    if isinstance(value, (str, bytes, bool, np.bool_)):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return math.nan
+
+
+def check_number(name: str, value: Any, minimum: float = -math.inf, maximum: float = math.inf) -> float:
+    """
+    Check a number.
+
+    :return: the value, a finite number in [minimum, maximum]
+    :raises ValueError: if it is anything else
+    """
+    number = _as_number(value)
+    if not math.isfinite(number) or not minimum <= number <= maximum:
+        raise ValueError(f"{name} must be {_allowed('a finite number', minimum, maximum)}, got {value!r}")
+    return number
+
+
+def check_integer(name: str, value: Any, minimum: int) -> int:
+    """
+    Check an integer.
+
+    :return: the value, an integer of at least ``minimum``; 1e6 is one, too
+    :raises ValueError: if it is anything else
+    """
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    number = value if is_integer else _as_number(value)
+    if not math.isfinite(number) or number != int(number) or number < minimum:
+        raise ValueError(f"{name} must be {_allowed('an integer', minimum, math.inf)}, got {value!r}")
+    return int(number)
+
+
+def find_non_finite(network: nn.Module, weights: dict[str, Any]) -> list[str]:
+    """
+    Look at parameters and running statistics; a constant, for instance the mask of an attention, may be infinite.
+
+    :param network: whose weights they are; its own are not looked at
+    :param weights: a state dict
+    :return: the names of those that are NaN or infinite
+    """
+    parameters = {name for name, _ in network.named_parameters(remove_duplicate=False)}
+    checked = (name for name in weights if name in parameters or "running_" in name)
+    return [name for name in checked if not weights[name].isfinite().all()]
+
+
+def check_action_space(action_space: spaces.Space) -> None:
+    """
+    Check that TDC can act in a space.
+
+    :raises ValueError: unless the actions are a bounded ``Box`` of floating-point numbers
+    """
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(f"env must have a Box action space (continuous actions), got {action_space}")
+    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+        raise ValueError(
+            f"env must have a bounded action space, got {action_space}: "
+            "wrap it in gymnasium.wrappers.RescaleAction or give the Box finite bounds"
+        )
+    if not (action_space.low < action_space.high).all():
+        raise ValueError(f"env must have an action space with low < high, got {action_space}")
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(f"env must have an action space of floating-point numbers, got {action_space}")
+    with np.errstate(over="ignore"):
+        widths = action_space.high - action_space.low
+    if not np.isfinite(widths).all():
+        raise ValueError(
+            f"env must have an action space whose width, high − low, is finite in {action_space.dtype}, got "
+            f"{action_space}: wrap it in gymnasium.wrappers.RescaleAction or give the Box narrower bounds"
+        )
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return ", did you mean ...?", or nothing if no known name is near."""
+    by_lower = {str(k).lower(): k for k in known}
+    nearest = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
+    return f"; did you mean {by_lower[nearest[0]]!r}?" if nearest else ""

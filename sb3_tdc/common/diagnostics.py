@@ -1,0 +1,87 @@
+"""Scalars of the training that stay on the device until the logger asks for them."""
+
+import math
+
+import torch as th
+from stable_baselines3.common.logger import Logger
+
+# Pending scalars are fetched when there are this many, so that a run that never logs still notices a NaN
+_MAX_PENDING = 1000
+
+
+class NonFiniteError(FloatingPointError):
+    """A loss, an action, a reward or a weight is NaN or infinite; the message says which and since when."""
+
+
+class Diagnostics:
+    """
+    Running means of scalar tensors by name. ``add`` never waits for the device; ``fetch`` does, once.
+
+    ``is_recorded`` says whether the logger has the means; whoever adds values sets it to False.
+    """
+
+    def __init__(self) -> None:
+        self._pending: list[tuple[str, int, int, th.Tensor]] = []
+        self._sums: dict[str, float] = {}
+        self._counts: dict[str, int] = {}
+        self._last_finite: dict[str, int] = {}
+        self._ended: list[str] = []  # means that begin anew with the next value
+        self.is_recorded = True
+
+    def add(self, update: int, timestep: int, values: dict[str, th.Tensor]) -> None:
+        """
+        Take scalars of one update.
+
+        :param update: count of gradient steps
+        :param timestep: count of environment steps
+        :param values: scalar tensors (without gradient) by name
+        :raises NonFiniteError: if a pending value turned out to be NaN or infinite
+        """
+        self._pending += [(name, update, timestep, value) for name, value in values.items()]
+        if len(self._pending) >= _MAX_PENDING:
+            self._collect()
+
+    def fetch(self) -> dict[str, float]:
+        """
+        Fetch the means from the device.
+
+        :return: the mean of every scalar since the last :meth:`restart`; if it had no value since, the mean before
+        :raises NonFiniteError: if one is NaN or infinite, with the update at which it was first seen
+        """
+        self._collect()
+        return {name: self._sums[name] / self._counts[name] for name in self._sums}
+
+    def restart(self) -> None:
+        """Begin every mean anew."""
+        self._collect()
+        self._ended = list(self._sums)
+
+    def record(self, logger: Logger) -> None:
+        """
+        Leave the means in a logger, as ``train/...``.
+
+        :raises NonFiniteError: as :meth:`fetch`
+        """
+        for name, mean in self.fetch().items():
+            logger.record(f"train/{name}", mean)
+        self.is_recorded = True
+
+    def _collect(self) -> None:
+        if not self._pending:
+            return
+        pending, self._pending = self._pending, []
+        numbers = th.stack([value for *_, value in pending]).tolist()  # the one wait for the device
+        for (name, update, timestep, _), number in zip(pending, numbers, strict=True):
+            if not math.isfinite(number):
+                last = self._last_finite.get(name)
+                before = f"it was last seen finite at update {last}" if last is not None else "it was never seen finite"
+                raise NonFiniteError(
+                    f"{name} is {number} since update {update} (timestep {timestep}); {before}. Training has "
+                    "stopped. Look for extreme rewards or observations, or lower the learning rates."
+                )
+            self._last_finite[name] = update
+            if name in self._ended:
+                self._ended.remove(name)
+                self._sums[name], self._counts[name] = 0.0, 0
+            self._sums[name] = self._sums.get(name, 0.0) + number
+            self._counts[name] = self._counts.get(name, 0) + 1

@@ -1,0 +1,62 @@
+"""Files that are never half written, folders that no two processes share."""
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def write_atomically(write: Callable[[Path], Any], path: Path) -> None:
+    """
+    Write a file next to its place, then rename it: a file that is already there stays whole until the new one is.
+
+    :param write: takes the path to write to, which has the same suffix
+    """
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        write(part)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def check_writable(flag: str, path: Path) -> None:
+    """
+    Make the folder of a file that will be written.
+
+    :param flag: that named the file, for the error
+    :raises ValueError: if it cannot be written
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        existed = path.exists()
+        with path.open("ab"):
+            pass
+        if not existed:
+            path.unlink()
+    except OSError as error:
+        raise ValueError(f"{flag} {path} cannot be written: {error.strerror}") from error
+
+
+def make_numbered(parent: Path, name: str, suffix: str = "") -> Path:
+    """Make the folder ``<name>_<next number>``; two processes that start at once get one each."""
+    parent.mkdir(parents=True, exist_ok=True)
+    number = max(numbered(parent, name), default=0) + 1
+    while True:
+        path = parent / f"{name}_{number}{suffix}"
+        try:
+            path.mkdir()
+        except FileExistsError:
+            number += 1
+        else:
+            return path
+
+
+def numbered(parent: Path, name: str) -> dict[int, Path]:
+    """Return the folders ``<name>_<number>``, by number; of several with one number (by UUID), the newest."""
+    folders = {}
+    for path in sorted(parent.glob(f"{name}_*"), key=lambda p: p.stat().st_mtime):
+        if path.is_dir() and (match := re.fullmatch(r"_(\d+)(_[0-9a-f-]{36})?", path.name[len(name) :])):
+            folders[int(match[1])] = path
+    return folders

@@ -1,0 +1,160 @@
+"""What the off-policy algorithms of this package share: checked arguments, schedules, a log, finite guards."""
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_tdc.common.checks import check_integer, check_number, find_non_finite
+from sb3_tdc.common.diagnostics import Diagnostics, NonFiniteError
+from sb3_tdc.common.saved_fields import SavedField
+from sb3_tdc.common.transitions import check_first_observation, check_transition
+
+
+class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """
+    An off-policy algorithm whose arguments are checked, and which neither learns from nor saves what is not finite.
+
+    A subclass calls ``diagnose`` at its updates and ``_record_training`` after them, and declares
+
+    - in ``schedules``, its arguments that may be schedules,
+    - in ``saved_fields``, what its saved models hold besides SB3's own fields,
+    - in ``captured_attributes``, what a resumed run needs of that which saved models leave out,
+    - in ``changeable``, its arguments that may be changed when a run is resumed,
+    - in ``color``, how figures draw it.
+    """
+
+    schedules: ClassVar[tuple[str, ...]] = ("learning_rate",)
+    saved_fields: ClassVar[dict[str, SavedField]] = {}
+    captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics",)
+    changeable: ClassVar[tuple[str, ...]] = ()
+    color: ClassVar[str | None] = None
+
+    # ---------------------------------------------------------------- arguments
+
+    def _check_arguments(self) -> None:
+        for name in ("tau", "gamma"):
+            setattr(self, name, check_number(name, getattr(self, name), 0.0, 1.0))
+        minima = {"learning_starts": 0, "gradient_steps": -1}
+        for name in ("buffer_size", "batch_size", "n_steps", *minima):
+            setattr(self, name, check_integer(name, getattr(self, name), minima.get(name, 1)))
+        for name in self.schedules:
+            value = self.scheduled(name, progress_remaining=1.0)
+            if getattr(self, name) is not None and not callable(getattr(self, name)):
+                setattr(self, name, value)
+        self._convert_train_freq()
+
+    def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
+        """The current value of one of ``schedules``, checked."""
+        value = getattr(self, name)
+        if name == "learning_rate" and progress_remaining is None:
+            value = self._current_lr_schedule()
+        if not callable(value):
+            return check_number(name, value, 0.0)
+        # A run overshoots its end by the rest of its last rollout; a schedule is for a progress between 1 and 0
+        progress = max(self._current_progress_remaining, 0.0) if progress_remaining is None else progress_remaining
+        return check_number(f"{name} (a schedule, at progress remaining {progress:.4g})", value(progress), 0.0)
+
+    def _current_lr_schedule(self) -> Schedule:
+        """SB3's ``lr_schedule``, made anew from ``learning_rate`` where that has been changed since."""
+        if self.learning_rate is not self._scheduled_learning_rate:
+            self.scheduled("learning_rate", progress_remaining=1.0)  # checks it
+            self._setup_lr_schedule()
+        return self.lr_schedule
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        self._scheduled_learning_rate = self.learning_rate
+
+    # ---------------------------------------------------------------- logging
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._diagnostics = Diagnostics()
+
+    def diagnose(self, **values: th.Tensor) -> None:
+        """Take scalars of this update into the means of the log; nothing waits for the device."""
+        self._diagnostics.add(self._n_updates, self.num_timesteps, values)
+
+    def _record_training(self) -> None:
+        """Leave in the logger what callbacks read there after ``train()``, as with every algorithm of SB3."""
+        logger = vars(self).get("_logger")
+        if logger is None:
+            return
+        for name in self.schedules:
+            logger.record(f"train/{name}", self.scheduled(name))
+        logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._diagnostics.is_recorded = False
+        if self.device.type == "cpu":
+            self._diagnostics.record(logger)  # there is no device to wait for
+
+    @property
+    def logger(self) -> Logger:
+        """SB3's logger; what was measured in training is fetched from the device when the logger is read."""
+        if not self._diagnostics.is_recorded:
+            self._diagnostics.record(self._logger)
+        return self._logger
+
+    def dump_logs(self) -> None:
+        """Write log data; the means of the training begin anew."""
+        super().dump_logs()
+        self._diagnostics.restart()
+
+    def prepare_to_continue(self) -> None:
+        """Make what a model that has been trained for some time has made, when a run is resumed."""
+
+    # ---------------------------------------------------------------- finite guards
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        try:
+            check_transition(self, buffer_action, new_obs, reward, dones, infos)
+        except NonFiniteError:
+            self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
+            raise
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        check_first_observation(self)
+        return prepared
+
+    def _non_finite_weights(self) -> list[str]:
+        """The names of weights that are NaN or infinite."""
+        return find_non_finite(self.policy, self.policy.state_dict())
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file.
+
+        :param path: path to the file where the rl agent should be saved
+        :param exclude: name of parameters that should be excluded in addition to the default ones
+        :param include: name of parameters that might be excluded but should be included anyway
+        :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
+        """
+        if broken := self._non_finite_weights():
+            raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
+        super().save(path, exclude, include)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_diagnostics", "_scheduled_learning_rate"]

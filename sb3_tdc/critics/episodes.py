@@ -1,0 +1,219 @@
+"""
+What the critics of TDC predict, against the returns that follow.
+
+Shapes: ``T`` steps of an episode, ``C`` critics, ``N`` quantiles. Predictions are of the critics at the state and the
+mean action that is played.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_tdc.tdc import TDC
+from sb3_tdc.tdc.quantiles import mean_and_std, quantile_midpoints, select_critic
+
+# A return is known where at most this share of a discounted stream of rewards comes after the end of what was played
+TOLERANCE = 0.01
+
+
+def discounted_returns(rewards: np.ndarray, gamma: float) -> np.ndarray:
+    """
+    The discounted sum of the rewards from every step on, G_t = r_t + γ·G_{t+1}.
+
+    :param rewards: (T,)
+    :return: (T,); what would have come after the last reward is not in it
+    """
+    returns = np.empty(len(rewards))
+    following = 0.0
+    for step in reversed(range(len(rewards))):
+        returns[step] = following = rewards[step] + gamma * following
+    return returns
+
+
+def known_steps(n_steps: int, terminated: bool, gamma: float, tolerance: float = TOLERANCE) -> int:
+    """
+    From how many first steps of an episode the whole discounted return has been seen.
+
+    :param terminated: whether it ended by itself; after a time limit, rewards would have gone on
+    :param tolerance: the largest weight γ^(T−t) of what was not seen
+    :return: between 0 and ``n_steps``
+    """
+    if terminated:
+        return n_steps
+    return max(n_steps - steps_until_negligible(gamma, tolerance), 0) if gamma < 1 else 0
+
+
+def steps_until_negligible(gamma: float, tolerance: float = TOLERANCE) -> int:
+    """Return the smallest n with γ^n at most ``tolerance``, for γ < 1."""
+    return int(np.ceil(np.log(tolerance) / np.log(gamma))) if gamma > 0 else 1
+
+
+def observed_frequency(quantiles: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """
+    How often the return stayed at or below each predicted quantile: of a calibrated critic, as often as its level says.
+
+    :param quantiles: (T, N)
+    :param returns: (T,)
+    :return: (N,), between 0 and 1
+    """
+    return (returns[:, None] <= quantiles).mean(axis=0)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """
+    One episode and what was predicted on its way.
+
+    :param steps: (M,), those that were looked at, in increasing order
+    :param quantiles: (M, C, N), predicted returns
+    :param selected: (M,), the critic that the target would take (Eq. 5)
+    :param returns: (M,), realised discounted returns; NaN where too much of it was not seen
+    """
+
+    steps: np.ndarray
+    quantiles: np.ndarray
+    selected: np.ndarray
+    returns: np.ndarray
+
+    @property
+    def means(self) -> np.ndarray:
+        """(M, C)"""
+        return self.quantiles.mean(axis=2)
+
+    @property
+    def stds(self) -> np.ndarray:
+        """(M, C), population standard deviations (Eq. 4)"""
+        return self.quantiles.std(axis=2)
+
+    @property
+    def overestimation(self) -> np.ndarray:
+        """(M, C), predicted mean − realised return; NaN where that is not known"""
+        return self.means - self.returns[:, None]
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """(C, N), see :func:`observed_frequency`; NaN if no return is known"""
+        known = np.isfinite(self.returns)
+        if not known.any():
+            return np.full(self.quantiles.shape[1:], np.nan)
+        critics = self.quantiles[known].transpose(1, 0, 2)
+        return np.stack([observed_frequency(quantiles, self.returns[known]) for quantiles in critics])
+
+
+def summarise(episodes: Sequence[Episode]) -> dict[str, float]:
+    """
+    Summarise episodes in two numbers.
+
+    :return: ``overestimation`` (mean over steps and critics, in units of the critics' return) and
+        ``calibration_error`` (mean over levels and critics of |observed − nominal|, between 0 and 0.5 or so), every
+        episode with the same weight; without episodes of known returns, nothing
+    """
+    known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
+    if not known:
+        return {}
+    frequencies = np.mean([episode.frequencies for episode in known], axis=0)
+    levels = quantile_midpoints(frequencies.shape[1]).numpy()
+    return {
+        "overestimation": float(np.mean([np.nanmean(episode.overestimation) for episode in known])),
+        "calibration_error": float(np.abs(frequencies - levels).mean()),
+    }
+
+
+class Recording:
+    """
+    Collects the steps of an episode, and at its end asks the critics about them all at once.
+
+    :param model: its critics, γ and λ
+    :param every: distance of the steps to look at, at least 1; the rewards of all steps count
+    :param normalization: what turns the rewards into those that the critics were trained on, if they are not yet
+    """
+
+    def __init__(self, model: TDC, every: int = 1, normalization: VecNormalize | None = None):
+        self.model, self.every, self.normalization = model, every, normalization
+        self.start()
+
+    def start(self) -> None:
+        """Begin an episode."""
+        self.rewards: list[float] = []
+        self.observations: list[Any] = []
+        self.actions: list[np.ndarray] = []
+
+    def add(self, observation: Any, action: np.ndarray, reward: float) -> None:
+        """
+        Record one step.
+
+        :param observation: without a batch axis, as the policy saw it
+        :param action: (A,)
+        :param reward: as the environment gave it
+        """
+        if len(self.rewards) % self.every == 0:
+            self.observations.append(observation)
+            self.actions.append(action)
+        self.rewards.append(reward)
+
+    def finish(self, terminated: bool, n_shown: int | None = None) -> Episode:
+        """
+        End the episode, and ask the critics about its steps.
+
+        :param terminated: whether the episode ended by itself
+        :param n_shown: leave out the steps from this one on
+        """
+        n_steps = len(self.rewards)
+        rewards = np.asarray(self.rewards)
+        if self.normalization is not None:
+            rewards = self.normalization.normalize_reward(rewards)  # as they are, if it does not normalise rewards
+        returns = discounted_returns(rewards, self.model.gamma)
+        returns[known_steps(n_steps, terminated, self.model.gamma) :] = np.nan
+        steps = np.arange(0, n_steps, self.every)
+        steps = steps[: np.searchsorted(steps, n_shown)] if n_shown is not None else steps
+        quantiles = predict_quantiles(self.model, self.observations[: len(steps)], np.stack(self.actions[: len(steps)]))
+        mean, std = mean_and_std(quantiles)
+        selected = select_critic(mean, std, self.model.scheduled("lam"))
+        return Episode(steps, quantiles.numpy().astype(float), selected.numpy(), returns[steps])
+
+
+def predict_quantiles(
+    model: TDC, observations: Sequence[Any], actions: np.ndarray, batch_size: int = 1024
+) -> th.Tensor:
+    """
+    Predict the quantiles of all critics for observations and actions.
+
+    :param observations: T of them, without a batch axis; arrays or dicts of arrays
+    :param actions: (T, A), as given to the environment
+    :return: (T, C, N) quantiles of the critics, on the CPU
+    """
+    policy = model.policy
+    policy.set_training_mode(False)
+    predicted = []
+    for begin in range(0, len(observations), batch_size):
+        some = observations[begin : begin + batch_size]
+        stacked = {k: np.stack([o[k] for o in some]) for k in some[0]} if isinstance(some[0], dict) else np.stack(some)
+        with th.no_grad():
+            scaled = th.as_tensor(policy.scale_action(actions[begin : begin + batch_size]), device=model.device)
+            predicted.append(policy.critic(policy.obs_to_tensor(stacked)[0], scaled.float().flatten(1)).cpu())
+    return th.cat(predicted)
+
+
+def record_episodes(model: TDC, env: VecEnv, n_episodes: int, limit: int | None = None) -> list[Episode]:
+    """
+    Play the mean action in one environment.
+
+    :param env: whose rewards are those that the critics were trained on
+    :param limit: leave out the steps from this one on; their rewards still count
+    """
+    recording = Recording(model)
+    episodes: list[Episode] = []
+    observation: Any = env.reset()
+    while len(episodes) < n_episodes:
+        action, _ = model.predict(observation, deterministic=True)
+        single = {k: v[0] for k, v in observation.items()} if isinstance(observation, dict) else observation[0]
+        observation, rewards, dones, infos = env.step(action)
+        recording.add(single, action[0], float(rewards[0]))
+        if dones[0]:
+            episodes.append(recording.finish(not infos[0].get("TimeLimit.truncated", False), limit))
+            recording.start()
+    return episodes

@@ -1,0 +1,131 @@
+"""From an environment id and hyperparameters to vectorised, wrapped, seeded environments."""
+
+import difflib
+import importlib
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
+
+from sb3_tdc.envs.checked import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
+from sb3_tdc.envs.mujoco import print_warnings_once
+from sb3_tdc.envs.processes import ignore_signals
+from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.resume import Restorable
+from sb3_tdc.safe_load import load_normalization
+
+# What constructors of environments, wrappers, algorithms and callbacks raise for what they do not allow
+SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportError, OSError, EOFError, gym.error.Error)
+
+
+def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
+    """
+    Split ``package:Env-v0``.
+
+    :param packages: those that are named elsewhere
+    :return: the environment's id alone, and all packages
+    """
+    package, _, env_id = env_id.rpartition(":")
+    return env_id, [*packages, *([package] if package and package not in packages else [])]
+
+
+def import_packages(packages: Sequence[str]) -> None:
+    """
+    Import packages that register environments.
+
+    :raises ValueError: for one that is not installed, with the command that installs it
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}"
+            ) from error
+
+
+def check_env_id(env_id: str) -> None:
+    """
+    Check that an environment is registered.
+
+    :raises ValueError: naming the nearest environment, if it is not registered
+    """
+    if env_id in gym.registry:
+        return
+    close = difflib.get_close_matches(env_id, gym.registry, n=3)
+    nearest = f"; did you mean {' or '.join(close)}?" if close else "."
+    raise ValueError(
+        f"There is no environment {env_id!r}{nearest} "
+        "An environment of another package is registered by --gym-packages PACKAGE."
+    )
+
+
+def make_envs(
+    env_id: str,
+    hyperparams: Hyperparams,
+    seed: int,
+    n_envs: int,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_env: str = "dummy",
+    monitor_folder: Path | None = None,
+    normalization: Path | None = None,
+    training: bool = True,
+    trust: bool = False,
+) -> VecEnv:
+    """
+    Make the environments of a run, wrapped as its hyperparameters say.
+
+    :param env_kwargs: of the environment's constructor, over those of the hyperparameters
+    :param vec_env: "dummy" (one process) or "subproc"
+    :param monitor_folder: for ``*.monitor.csv``
+    :param normalization: saved statistics for ``VecNormalize``
+    :param training: False: statistics stay as they are and rewards are not normalised
+    :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
+    """
+    is_subproc = vec_env == "subproc"
+    env = make_vec_env(
+        _maker(env_id, hyperparams, ignores_signals=is_subproc),
+        n_envs=n_envs,
+        seed=seed,
+        monitor_dir=str(monitor_folder) if monitor_folder else None,
+        monitor_kwargs=hyperparams.monitor_kwargs,
+        env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
+        vec_env_cls=CheckedSubprocVecEnv if is_subproc else DummyVecEnv,
+        wrapper_class=Restorable if is_subproc else None,
+    )
+    for wrapper in hyperparams.vec_env_wrapper:
+        env = wrapper(env)
+    if hyperparams.frame_stack is not None:  # before normalising: replay stores what VecNormalize was given
+        env = VecFrameStack(env, hyperparams.frame_stack)
+    if hyperparams.normalize is not None:
+        if normalization is not None:
+            env = VecNormalize.load(str(normalization), env) if trust else load_normalization(normalization, env)
+        else:
+            env = VecNormalize(env, **hyperparams.normalize)
+        if not training:
+            env.training, env.norm_reward = False, False
+    return env
+
+
+def _maker(env_id: str, hyperparams: Hyperparams, ignores_signals: bool) -> Any:
+    """Return what makes one environment, perhaps in a process of its own. Its ``Monitor`` will be the outermost."""
+    spec = gym.spec(env_id)
+
+    def make_env(**kwargs: Any) -> gym.Env:
+        if ignores_signals:
+            ignore_signals()
+        try:
+            print_warnings_once()
+            env = spec.make(**kwargs)
+            for wrapper in hyperparams.env_wrapper:
+                env = wrapper(env)
+            return CheckedEnv(env)
+        except Exception as error:
+            reason = describe_exception(error)
+            raise EnvironmentFaultError(f"{env_id} cannot be made: {reason}", traceback.format_exc()) from error
+
+    return make_env

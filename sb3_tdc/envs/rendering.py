@@ -1,0 +1,115 @@
+"""Pictures without a display: which OpenGL backend MuJoCo can use, and video files."""
+
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import load_env_creator
+
+VIDEO_SUFFIXES = (".mp4", ".gif", ".webm", ".mkv", ".mov", ".avi")
+_GL_BACKENDS = ("egl", "osmesa")
+_TRY_DISPLAY = "import sys, glfw; sys.exit(not glfw.init())"
+_TRY_BACKEND = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
+
+
+def render_modes(env_id: str) -> set[str]:
+    """Return the modes that an environment can be made with: none if its constructor takes no ``render_mode``."""
+    entry_point = gym.spec(env_id).entry_point
+    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    parameters = inspect.signature(creator).parameters.values()
+    if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+        return set()
+    metadata = getattr(creator, "metadata", None) or {}  # a function has none: it may draw anything
+    return set(metadata.get("render_modes", ("human", "rgb_array")))
+
+
+def display_works() -> bool:
+    """Return whether a window can be opened: a display may be named that is gone (ssh -X, tmux)."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    attempt = subprocess.run([sys.executable, "-c", _TRY_DISPLAY], capture_output=True)
+    return attempt.returncode == 0
+
+
+def choose_gl_backend(is_window: bool = False) -> str:
+    """
+    Set ``MUJOCO_GL`` to a backend that works without a display, unless it is set already or there is a display.
+
+    To be called before ``mujoco`` is imported: it reads the variable then.
+
+    :param is_window: whether a window is wanted, for which there is a display
+    :return: a sentence on what is used
+    :raises ValueError: if nothing works, with the commands that install one
+    """
+    if os.environ.get("MUJOCO_GL"):
+        return f"Rendering with MUJOCO_GL={os.environ['MUJOCO_GL']} (from the environment)"
+    if is_window or display_works():
+        return "Rendering with the display's OpenGL"
+    for backend in _GL_BACKENDS:
+        attempt = subprocess.run(
+            [sys.executable, "-c", _TRY_BACKEND], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True
+        )
+        if attempt.returncode == 0:
+            os.environ["MUJOCO_GL"] = backend
+            return f"Rendering with MUJOCO_GL={backend} (no display)"
+    raise ValueError(
+        "MuJoCo cannot render: there is no display, and neither EGL nor OSMesa works. "
+        "On Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 (or libosmesa6)"
+    )
+
+
+def follow_agent(env: gym.Env) -> None:
+    """Let MuJoCo's pictures follow the agent, unless the environment was given a camera (-v4 tasks lose it)."""
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    if renderer is None or renderer.camera_id not in (None, -1):
+        return
+    import mujoco
+
+    # Frames are taken from a camera of the model, a window from the camera that the configuration describes
+    renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    torso = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_BODY, "torso")
+    if torso != -1:
+        tracking = {"type": int(mujoco.mjtCamera.mjCAMERA_TRACKING), "trackbodyid": torso}
+        renderer.default_cam_config = {**tracking, **(renderer.default_cam_config or {})}
+
+
+class VideoWriter:
+    """
+    A context that writes frames to a video file.
+
+    :param path: the file; its ending chooses the format (.mp4, .gif, ...)
+    :param fps: frames per second
+    :raises ImportError: if imageio or its ffmpeg is missing, with the command that installs them
+    """
+
+    def __init__(self, path: Path, fps: float):
+        try:
+            import imageio.v2 as imageio
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise ImportError('Recording needs imageio and ffmpeg: pip install "sb3-tdc[video]"') from error
+        self.writer: Any = imageio.get_writer(path, fps=fps)
+
+    def add(self, frame: np.ndarray) -> None:
+        """
+        Write a frame.
+
+        :param frame: (height, width, 3), uint8
+        """
+        self.writer.append_data(frame)
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.writer.close()

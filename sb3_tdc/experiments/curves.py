@@ -1,0 +1,62 @@
+"""Runs → curves of figures: binned evaluations and diagnostics, for every seed."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.experiments import figures, statistics
+from sb3_tdc.experiments.results import Group, Run
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
+
+_BIN = 20_000  # environment steps, at the paper's scale
+
+
+def headline(groups: Sequence[Group]) -> list[Group]:
+    """Of one environment: each algorithm as its hyperparameter file has it; where it has not been run so, all of it."""
+    plain = {group.algo for group in groups if group.label == group.algo.upper()}
+    return [group for group in groups if group.label == group.algo.upper() or group.algo not in plain]
+
+
+def published_steps(algo: str, env_id: str) -> int:
+    """Return environment steps of the hyperparameter file, those of the paper for its tasks."""
+    return read_entry(hyperparams_file(algo), env_id)[0]["n_timesteps"]
+
+
+def bin_width(group: Group) -> int:
+    """20,000 steps, scaled; a multiple of the distance of evaluations, so that every bin has as many."""
+    scale = group.n_timesteps / published_steps(group.algo, group.env_id) if group.algo in ALGORITHMS else 1.0
+    frequency = max(group.setting("eval_freq") or 0, 1)
+    return max(round(_BIN * scale / frequency), 1) * frequency
+
+
+def read_evaluations(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays (evaluations,): timesteps, mean returns."""
+    if run.evaluations is None:
+        return np.empty(0), np.empty(0)
+    return run.evaluations.timesteps, run.evaluations.returns.mean(axis=1)
+
+
+def read_td_errors(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays (log entries,): timesteps, variance of TD errors."""
+    steps, variances = run.progress("time/total_timesteps", "train/td_error_var").T
+    return steps, variances
+
+
+def make_curve(
+    group: Group, label: str, color: Any, width: int, read: Callable[[Run], tuple[np.ndarray, np.ndarray]]
+) -> figures.Curve:
+    """
+    Bin the values of all runs of a group.
+
+    :param read: a run → timesteps and values
+    """
+    edges = statistics.bin_edges(max(group.n_timesteps, *(run.steps for run in group.runs)), width)
+
+    def stack(runs: Iterable[Run]) -> np.ndarray:
+        rows = [statistics.bin_means(*read(run), edges) for run in runs]
+        return np.array(rows).reshape(-1, len(edges) - 1)
+
+    unfinished = [run for run in group.runs if run not in group.finished]
+    return figures.Curve(label, color, edges[1:], stack(group.finished), stack(unfinished))

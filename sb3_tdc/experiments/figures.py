@@ -1,0 +1,167 @@
+"""Figures of the paper: functions that draw arrays on axes of matplotlib, and read no file."""
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.plots import style_axes
+from sb3_tdc.experiments.statistics import mean_interval
+
+# Okabe and Ito's colours, which the colour-blind can tell apart
+_OF_SB3 = {"TD3": "#D55E00", "SAC": "#009E73", "DDPG": "#CC79A7"}
+COLORS: dict[str, str] = _OF_SB3 | {
+    name.upper(): color for name, algorithm in ALGORITHMS.items() if (color := vars(algorithm).get("color")) is not None
+}
+OTHER_COLORS = ("#56B4E9", "#000000", "#7F7F7F", "#8C564B", "#9467BD", "#BCBD22")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """
+    One line of a figure.
+
+    :param steps: (bins,), the last step of every bin
+    :param values: (runs, bins), of the runs that are averaged
+    :param unfinished: (runs, bins), of runs that are shown, but not averaged
+    """
+
+    label: str
+    color: Any
+    steps: np.ndarray
+    values: np.ndarray
+    unfinished: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+
+
+def wrap(label: str, width: int) -> str:
+    """Break a long label into at most three lines; what is cut off is in the caption of the figure."""
+    return "\n".join(textwrap.wrap(label, width, max_lines=3, placeholder=" …"))
+
+
+def count_seeds(n: int, unfinished: int = 0) -> str:
+    """``"3 seeds, 1 unfinished"``."""
+    text = "1 seed" if n == 1 else f"{n} seeds"
+    return f"{text}, {unfinished} unfinished" if unfinished else text
+
+
+def draw_curves(axes: Any, curves: Sequence[Curve], title: str, ylabel: str, log: bool = False) -> None:
+    """
+    Mean over seeds with its 95 % t interval, every seed as a thin line; an unfinished one is dotted.
+
+    One seed has no interval; that of two can be huge, and runs off the axis, which is made for the seeds. On a
+    logarithmic axis, means and intervals are those of the logarithms.
+    """
+    if log:
+        axes.set_yscale("log")
+    for curve in curves:
+        for values, style in ((curve.values, "-"), (curve.unfinished, ":")):
+            for run in values:
+                axes.plot(*_finite(curve.steps, run), style, color=curve.color, lw=0.7, alpha=0.45)
+        label = f"{wrap(curve.label, 44)} · {count_seeds(len(curve.values), len(curve.unfinished))}"
+        values = np.log(curve.values) if log else curve.values
+        mean, low, high = (np.exp(v) if log else v for v in mean_interval(values))
+        axes.plot(*_finite(curve.steps, mean), color=curve.color, lw=1.8, label=label)
+        axes.fill_between(curve.steps, low, high, color=curve.color, alpha=0.15, lw=0)
+    seeds = np.concatenate([v.ravel() for curve in curves for v in (curve.values, curve.unfinished)])
+    axes.set_ylim(*_limits(seeds[np.isfinite(seeds)], log))
+    style_axes(axes, title, "environment steps", ylabel)
+    axes.xaxis.set_major_formatter(_short_number)
+    axes.legend(frameon=False, fontsize="small")
+
+
+def draw_box_plots(
+    axes: Any, labels: Sequence[str], colors: Sequence[Any], returns: Sequence[np.ndarray], title: str
+) -> None:
+    """
+    One box for each algorithm, over the episodes of all its runs (whiskers: 1.5 interquartile ranges); the mean of
+    each run is a dot.
+
+    :param returns: for each algorithm (runs, episodes)
+    """
+    positions = np.arange(len(labels))
+    boxes = axes.boxplot(
+        [r.ravel() for r in returns],
+        positions=positions,
+        widths=0.5,
+        patch_artist=True,
+        medianprops={"color": "black"},
+        flierprops={"marker": ".", "markersize": 3, "alpha": 0.4},
+    )
+    for box, color in zip(boxes["boxes"], colors, strict=True):
+        box.set(facecolor=color, alpha=0.35)
+    for position, color, r in zip(positions, colors, returns, strict=True):
+        axes.scatter(np.full(len(r), position), r.mean(axis=1), color=color, edgecolor="black", lw=0.6, s=22, zorder=3)
+    style_axes(axes, title, "", f"return of {returns[0].shape[1]} test episodes a run")
+    width = max(10, 60 // max(len(labels), 1))
+    ticks = [f"{wrap(label, width)}\n{count_seeds(len(r))}" for label, r in zip(labels, returns, strict=True)]
+    axes.set_xticks(positions, ticks, fontsize="small")
+    axes.grid(visible=False, axis="x")
+
+
+def draw_sweep(
+    axes: Any, values: Sequence[float], returns: Sequence[np.ndarray], title: str, xlabel: str, color: Any
+) -> None:
+    """
+    Return against a hyperparameter: the mean over seeds with its 95 % t interval, every seed as a dot.
+
+    :param values: of the hyperparameter, increasing
+    :param returns: for each value (runs,)
+    """
+    means, lows, highs = np.array([mean_interval(r) for r in returns]).T
+    axes.plot(values, means, "-", color=color, lw=1.8)
+    several = np.isfinite(lows)
+    if several.any():
+        x, y = np.asarray(values)[several], means[several]
+        axes.errorbar(x, y, [y - lows[several], highs[several] - y], fmt="none", color=color, capsize=4, lw=1.2)
+    for value, r in zip(values, returns, strict=True):
+        axes.scatter(np.full(len(r), value), r, color=color, edgecolor="white", lw=0.6, s=26, zorder=3)
+    everything = np.concatenate(returns)
+    axes.set_ylim(*_limits(everything, log=False))
+    few, many = min(map(len, returns)), max(map(len, returns))
+    seeds = count_seeds(few) if few == many else f"{few} to {count_seeds(many)}"
+    style_axes(axes, title, f"{xlabel} ({seeds} each)", "final return")
+    axes.set_xticks(values, [f"{value:g}" for value in values])
+
+
+def draw_intervals(
+    axes: Any,
+    labels: Sequence[str],
+    colors: Sequence[Any],
+    intervals: Sequence[tuple[float, float, float]],
+    title: str,
+    xlabel: str,
+) -> None:
+    """One row for each label: a point and its interval. :param intervals: point, low, high"""
+    for row, (color, (point, low, high)) in enumerate(zip(colors, intervals, strict=True)):
+        axes.plot([low, high], [row, row], color=color, lw=6, alpha=0.3, solid_capstyle="butt")
+        axes.plot(point, row, "o", color=color)
+    style_axes(axes, title, xlabel, "")
+    axes.set_yticks(range(len(labels)), ["\n".join(wrap(line, 22) for line in label.split("\n")) for label in labels])
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+
+
+def _limits(values: np.ndarray, log: bool) -> tuple[float | None, float | None]:
+    """The range of the values and a third of it on either side."""
+    if not len(values):
+        return None, None
+    low, high = np.log((values.min(), values.max())) if log else (values.min(), values.max())
+    margin = (high - low) / 3 or 1.0
+    limits = np.array([low - margin, high + margin])
+    low, high = np.exp(limits) if log else limits
+    return float(low), float(high)
+
+
+def _finite(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Without empty bins, across which a line is drawn through."""
+    there = np.isfinite(values)
+    return steps[there], values[there]
+
+
+def _short_number(number: float, _: int) -> str:
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if abs(number) >= size:
+            return f"{number / size:g}{unit}"
+    return f"{number:g}"

@@ -1,0 +1,94 @@
+"""Play 100 mean-action episodes with the last model of every finished run (Fig. 4), and keep their returns with it.
+
+Episode i begins with the evaluation seed 10,000 + i in every run, so that algorithms meet the same initial states.
+"""
+
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Sequence
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdc.common.files import write_atomically
+from sb3_tdc.experiments.results import Run
+from sb3_tdc.experiments.suites import PACKAGES
+from sb3_tdc.runs.trained import open_run
+
+FILE = "test_returns.npz"
+
+
+EPISODES = 100
+
+
+FIRST_SEED = 10_000
+
+
+def play_final_episodes(model: BaseAlgorithm, env: VecEnv, episodes: int, first_seed: int = FIRST_SEED) -> np.ndarray:
+    """
+    Play episodes of the mean action, each from the initial state of another seed.
+
+    :param env: one environment, under a ``Monitor``
+    :return: (episodes,), the return of the mean action from the initial state of each seed
+    """
+    returns = np.empty(episodes)
+    for episode in range(episodes):
+        env.seed(first_seed + episode)
+        observation: Any = env.reset()
+        done = False
+        while not done:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, _, dones, infos = env.step(action)
+            done = dones[0]
+        returns[episode] = infos[0]["episode"]["r"]
+    return returns
+
+
+def checksum(run: Run) -> str:
+    """Return SHA-256 of the model and of its normalisation: what the returns depend on."""
+    digest = hashlib.sha256(run.folder.model.read_bytes())
+    normalization = run.folder.normalization(run.folder.model)
+    if normalization.is_file():
+        digest.update(normalization.read_bytes())
+    return digest.hexdigest()
+
+
+def read_test_returns(run: Run) -> np.ndarray | None:
+    """Return (episodes,), or None if the model as it is now has not been tested."""
+    path = run.folder.path / FILE
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path) as saved:
+            # Published results have no model that could have changed
+            is_of_model = not run.folder.model.is_file() or str(saved["checksum"]) == checksum(run)
+            return saved["returns"] if is_of_model else None
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):  # played again
+        return None
+
+
+def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()) -> np.ndarray:
+    """
+    Play the episodes and keep their returns, unless they are kept already.
+
+    :param packages: those that a run may import, to register its environment
+    :return: (episodes,)
+    :raises ValueError: if the run cannot be loaded
+    """
+    kept = read_test_returns(run)
+    if kept is not None and len(kept) >= episodes:
+        return kept[:episodes]
+    before = checksum(run)
+    asked_for = run.folder.args.get("gym_packages") or []
+    known = [package for package in PACKAGES.values() if package in asked_for]
+    trained = open_run(run.folder, run.folder.model, [*packages, *known])
+    env = trained.make_env(FIRST_SEED, **(trained.eval_env_kwargs or trained.env_kwargs))
+    with closing(env):
+        returns = play_final_episodes(trained.load(None, "cpu"), env, episodes)
+    contents: dict[str, Any] = {"returns": returns, "checksum": before, "first_seed": FIRST_SEED}
+    write_atomically(lambda part: np.savez(part, **contents), run.folder.path / FILE)
+    return returns

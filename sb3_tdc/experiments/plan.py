@@ -1,0 +1,187 @@
+"""The runs of a suite: what there is to do, and how long it takes."""
+
+import heapq
+import importlib
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.checks import suggest
+from sb3_tdc.experiments.jobs import Job
+from sb3_tdc.experiments.results import default_settings, find_runs, same_settings
+from sb3_tdc.experiments.suites import ISAAC, PACKAGES, Cell
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.runs.settings import RunSettings
+from sb3_tdc.runs.setup import make_run
+from sb3_tdc.runs.training import train
+
+# Of a measurement of speed: the first updates compile, allocate, warm up
+_FIRST, _LAST = 100, 300
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What is to be done for a suite.
+
+    :param jobs: what a suite asks for, each once
+    :param missing: a sentence for each cell that cannot be run here
+    """
+
+    jobs: list[Job]
+    missing: list[str]
+
+
+def select(cells: Iterable[Cell], only: Sequence[str]) -> list[Cell]:
+    """
+    Select cells of a suite.
+
+    :param only: algorithms and environments; where none of a kind is named, all of it
+    :raises ValueError: for one that no cell has
+    """
+    cells = list(cells)
+    algos, env_ids = {cell.algo for cell in cells}, {cell.env_id for cell in cells}
+    for name in only:
+        if name not in algos | env_ids:
+            known = [*sorted(algos), *sorted(env_ids)]
+            raise ValueError(f"--only {name} is not in the suite{suggest(name, known)}; it has {', '.join(known)}")
+    algos, env_ids = algos & set(only) or algos, env_ids & set(only) or env_ids
+    return [cell for cell in cells if cell.algo in algos and cell.env_id in env_ids]
+
+
+def make_plan(cells: Sequence[Cell], seeds: Sequence[int], scale: float, logs: Path) -> Plan:
+    """
+    Seed by seed, so that a matrix that is stopped early has something of every cell.
+
+    :param scale: the fraction of the suite's steps
+    :param logs: of all runs; those of a scale, or of a number of steps, have a folder of their own
+    """
+    missing = {f"{cell.algo} on {cell.env_id}": _why_missing(cell) for cell in cells}
+    possible = [cell for cell in cells if not missing[f"{cell.algo} on {cell.env_id}"]]
+    found = {}
+    for seed in seeds:
+        for job in (make_job(cell, seed, scale, logs) for cell in possible):
+            found[job.logs, job.algo, job.env_id] = job
+    return Plan(list(found.values()), [f"{what}: {why}" for what, why in missing.items() if why])
+
+
+def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
+    """What a cell says that ``hyperparams/`` or a default says too is left out: cells of two suites may be one job."""
+    entry, _ = read_entry(hyperparams_file(cell.algo), cell.env_id)
+    implied = {**default_settings(cell.algo), **entry}
+    settings = {key: value for key, value in cell.settings.items() if not same_settings(implied.get(key), value)}
+    variant = ",".join(f"{key}={value}" for key, value in settings.items())
+    n_timesteps = max(round(scale * (cell.n_timesteps or entry["n_timesteps"])), 1)
+    length = f"steps_{n_timesteps}" if cell.n_timesteps else f"scale_{scale:g}"
+    return Job(
+        cell.algo,
+        cell.env_id,
+        seed,
+        n_timesteps=n_timesteps,
+        logs=logs.resolve() / length / variant / f"seed_{seed}",
+        settings=settings,
+        packages=(PACKAGES[cell.env_id],) if cell.env_id in PACKAGES else (),
+    )
+
+
+def _why_missing(cell: Cell) -> str:
+    """Return why a cell cannot be run here, or ""."""
+    if cell.algo not in ALGORITHMS:
+        return f"this version of the package has no {cell.algo.upper()}"
+    if cell.env_id in ISAAC:
+        return "Isaac Lab starts its own simulator, with environments of tensors, which train.py does not take"
+    if package := PACKAGES.get(cell.env_id):
+        try:
+            importlib.import_module(package)
+        except ImportError:
+            return f"pip install {package}"
+    return "" if cell.env_id in gym.registry else "there is no such environment"
+
+
+def estimate_seconds(seconds: Iterable[float], n_jobs: int) -> float:
+    """Return the time until all jobs have ended, if each is taken by the first of ``n_jobs`` workers that is free."""
+    free_at = [0.0] * n_jobs
+    for duration in seconds:
+        heapq.heappush(free_at, heapq.heappop(free_at) + duration)
+    return max(free_at)
+
+
+def read_rates(logs: Path) -> dict[tuple[str, str], float]:
+    """
+    Environment steps per second, evaluations included, of finished runs.
+
+    :return: by algorithm and environment, the median; including the time before a stopped run was resumed
+    """
+    found: dict[tuple[str, str], list[float]] = {}
+    try:
+        runs, _ = find_runs(logs)
+    except ValueError:
+        return {}
+    for finished in (one for one in runs if one.is_finished):
+        progress = finished.progress("time/total_timesteps", "time/time_elapsed")
+        if len(progress) and progress[-1, 1] > 0:
+            found.setdefault((finished.algo, finished.env_id), []).append(progress[-1, 0] / progress[-1, 1])
+    return {key: float(np.median(rates)) for key, rates in found.items()}
+
+
+class _Clock(BaseCallback):
+    """Reads the time at two steps."""
+
+    times: dict[int, float]
+
+    def _on_training_start(self) -> None:
+        self.times = {}
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps in (_FIRST, _LAST):
+            self.times[self.num_timesteps] = time.perf_counter()
+        return True
+
+
+def measure_rate(job: Job) -> float:
+    """Return environment steps per second, with updates, without evaluations; on one thread, over a few hundred."""
+    clock = _Clock()
+    with tempfile.TemporaryDirectory() as folder:
+        settings = RunSettings(
+            algo=job.algo,
+            env=job.env_id,
+            n_timesteps=_LAST,
+            seed=job.seed,
+            log_folder=folder,
+            hyperparams=replace(job, n_timesteps=_LAST).config,
+            gym_packages=list(job.packages),
+            eval_freq=-1,
+            resume_freq=-1,
+            num_threads=1,
+            device="cpu",
+            verbose=0,
+        )
+        run = make_run(settings)
+        run.hyperparams.callbacks.append(lambda: clock)
+        if train(run).interrupted:
+            raise KeyboardInterrupt
+    return (_LAST - _FIRST) / (clock.times[_LAST] - clock.times[_FIRST])
+
+
+def dry_run(plan: Plan, rates: Mapping[tuple[str, str], float], n_jobs: int) -> None:
+    """Print what would be done with every job, and how long it would take."""
+    rates, seconds = dict(rates), []
+    for job in plan.jobs:
+        key, done = (job.algo, job.env_id), job.steps_done
+        verb = "skip" if job.is_finished else "run" if job.run_folder is None else "resume"
+        print(f"{verb:6} {job}, {job.n_timesteps:,} steps" + (f", {done:,} done" if verb == "resume" else ""))
+        if verb != "skip":
+            if key not in rates:
+                rates[key] = measure_rate(job)
+                print(f"       {rates[key]:.0f} steps/s, of {_LAST - _FIRST} steps, without evaluations")
+            seconds.append((job.n_timesteps - done) / rates[key])
+    total = timedelta(seconds=round(estimate_seconds(seconds, n_jobs)))
+    print(f"{len(seconds)} of {len(plan.jobs)} to run, {n_jobs} at once: about {total} (hours:minutes:seconds)")

@@ -1,0 +1,132 @@
+"""Where a report comes from, what of the paper it has, and what it lacks."""
+
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+
+import gymnasium as gym
+import pandas as pd
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.versions import commit_of_the_code, processor_name
+from sb3_tdc.experiments.results import Group, Run, describe, differences
+from sb3_tdc.experiments.suites import PAPER, Cell
+from sb3_tdc.experiments.tables import number
+
+_PACKAGES = ("sb3-tdc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy", "scipy")
+_TITLES = {
+    "fig1": "Fig. 1, algorithms",
+    "fig2": "Fig. 2, heads of TDC",
+    "fig3": "Fig. 3, λ",
+    "fig5": "Fig. 5, other simulators",
+    "figS1": "Fig. S1, TD errors",
+}
+
+
+def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
+    """Return titles and tables: the seeds of every experiment of the paper, and why the absent ones are absent."""
+    found = []
+    absent: dict[str, dict[str, list[str]]] = {}
+    for suite, cells in PAPER.items():
+        table = pd.DataFrame(
+            "",
+            index=list(dict.fromkeys(cell.env_id for cell in cells)),
+            columns=list(dict.fromkeys(map(_column, cells))),
+        )
+        for cell in cells:
+            members = [run for run in runs if cell.includes(run)]
+            done = len({run.seed for run in members if run.is_finished})
+            others = len({run.seed for run in members if not run.is_finished})
+            table.loc[cell.env_id, _column(cell)] = f"{done or '–'}" + (f" (+ {others} unfinished)" if others else "")
+            if not members:
+                envs = absent.setdefault(_why_absent(cell), {}).setdefault(_column(cell), [])
+                envs += [cell.env_id] if cell.env_id not in envs else []
+        found.append((_TITLES[suite], table.rename_axis("Environment").reset_index()))
+    rows = [
+        {"Why": why, "Absent": "; ".join(f"{what} on {', '.join(envs)}" for what, envs in cells.items())}
+        for why, cells in absent.items()
+    ]
+    return [*found, ("Absent runs", pd.DataFrame(rows, columns=["Why", "Absent"]))]
+
+
+def _column(cell: Cell) -> str:
+    shown = describe({k: v for k, v in cell.settings.items() if k == "lam" or v})
+    return f"{cell.algo.upper()}, {shown}" if shown else cell.algo.upper()
+
+
+def _why_absent(cell: Cell) -> str:
+    if cell.algo not in ALGORITHMS:
+        return f"This version of the package has no {cell.algo.upper()}"
+    if cell.env_id not in gym.registry:
+        return "Their simulator is not installed, or not imported, where this report was made"
+    return "There is no such run in the folder"
+
+
+def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFrame:
+    """Runs that are not averaged, and why; empty if there are none."""
+    rows = []
+    for run in runs:
+        if not run.is_finished or run.evaluations is None:
+            if run.is_finished:
+                why = "finished, but was not evaluated"
+            elif run.folder.model.is_file():
+                why = "stopped early; the model was saved"
+            else:
+                why = "no model was saved: still running, killed or failed"
+            rows.append({"Run": str(run.folder.path), "Steps": f"{run.steps:,} of {run.n_timesteps:,}", "Why": why})
+    return pd.DataFrame([*rows, *({"Run": text, "Steps": "", "Why": "unreadable"} for text in unreadable)])
+
+
+def describe_groups(groups: Sequence[Group]) -> pd.DataFrame:
+    """What of its hyperparameters is not in ``hyperparams/``, for every group."""
+    return pd.DataFrame(
+        [
+            {
+                "Environment": group.env_id,
+                "Algorithm": group.label,
+                "Steps": f"{group.n_timesteps:,}",
+                "Finished seeds": group.seeds,
+                "Differs from hyperparams/": describe(differences(group.runs[0])) or "nothing",
+            }
+            for group in groups
+        ]
+    )
+
+
+def describe_runs(runs: Sequence[Run]) -> pd.DataFrame:
+    """Every run: its command, and what it was trained with."""
+    rows = []
+    for run in runs:
+        elapsed = run.progress("time/time_elapsed")
+        rows.append(
+            {
+                "Run": str(run.folder.path),
+                "Seed": run.seed,
+                "Steps": f"{run.steps:,}",
+                "Minutes": number(elapsed[-1] / 60) if len(elapsed) else "–",
+                "Command": run.command,
+                "Trained with": run.system,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def describe_machine() -> dict[str, str]:
+    """Of the machine and the code that made the report."""
+    versions = []
+    for package in _PACKAGES:
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            versions.append(f"{package} –")
+    return {
+        "Made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        "Command": shlex.join(sys.orig_argv),
+        "Commit of the code that made it": commit_of_the_code() or "not in a git repository",
+        "Machine that made it": f"{processor_name()}, {os.cpu_count()} cores, {platform.platform()}",
+        "Versions there": ", ".join([f"Python {platform.python_version()}", *versions]),
+    }

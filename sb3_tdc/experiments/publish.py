@@ -1,0 +1,65 @@
+"""Copy the small files of finished runs into a folder that can be committed: all that the report reads.
+
+A run keeps its place below the folder, so that the matrix finds it there and does not train it again.
+"""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.experiments import final_episodes as test_returns
+from sb3_tdc.experiments.results import Run
+
+RESULTS = Path("results")
+
+
+_FILES = ("evaluations.npz", test_returns.FILE)
+
+
+_SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
+
+
+# Rows of the log; more show the same curve
+_ROWS = 150
+
+
+_COLUMNS = ("time/", "train/", "eval/", "rollout/ep_rew_mean")
+
+
+_LEFT_OUT = ("time/fps", "time/episodes", "time/critics_elapsed")
+
+
+def publish(run: Run, logs: Path, folder: Path) -> Path:
+    """
+    Copy the small files of a finished run; its log thinned, its paths relative to ``logs``.
+
+    :return: where they are
+    """
+    source, place = run.folder, folder / run.folder.path.relative_to(logs)
+    target = place / source.env_name
+    target.mkdir(parents=True, exist_ok=True)
+    for name in _FILES:
+        if (source.path / name).is_file():
+            shutil.copyfile(source.path / name, place / name)
+    for name in _SETTINGS:
+        if (source.path / source.env_name / name).is_file():
+            shutil.copyfile(source.path / source.env_name / name, target / name)
+    relative = str(place.relative_to(folder).parents[1])
+    arguments = {**source.args, "log_folder": relative}
+    (target / "args.yml").write_text(plain_yaml.dump(arguments))
+    (target / "command.txt").write_text(run.command.replace(str(source.args["log_folder"]), relative) + "\n")
+    log = pd.read_csv(source.path / "progress.csv")
+    _thin(log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
+    return place
+
+
+def _thin(log: pd.DataFrame) -> pd.DataFrame:
+    """Return at most ``_ROWS`` rows of what was trained and timed, and every row with an evaluation."""
+    columns = [name for name in log if str(name).startswith(_COLUMNS) and name not in _LEFT_OUT]
+    evenly = np.unique(np.linspace(0, len(log) - 1, _ROWS).round().astype(int))
+    evaluated = [name for name in log if str(name).startswith("eval/")]
+    rows = set(evenly) | set(np.flatnonzero(log[evaluated].notna().any(axis=1)))
+    return log.loc[sorted(rows), columns]

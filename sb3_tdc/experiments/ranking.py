@@ -1,0 +1,84 @@
+"""What a search has found: a table, figures, and the hyperparameters of the best candidate."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.commands import command
+from sb3_tdc.experiments.figures import COLORS, draw_sweep
+from sb3_tdc.experiments.jobs import Job, eval_freq
+from sb3_tdc.experiments.trials import read_returns
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
+
+
+def rank(candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> pd.DataFrame:
+    """
+    The best first: by the mean over seeds of the mean of all evaluations, at the steps that all its seeds have.
+
+    A candidate with fewer steps than another (stopped early, or failed) comes after it.
+
+    :param candidates: of each, its seeds
+    :param searched: names of hyperparameters, the first columns
+    """
+    rows = []
+    for number, jobs in enumerate(candidates):
+        scores = read_returns(jobs)
+        steps = scores.shape[1] * eval_freq(jobs[0].n_timesteps)
+        per_seed = scores.mean(axis=1) if steps else np.full(len(jobs), np.nan)
+        spread = per_seed.std(ddof=1) if len(jobs) > 1 else np.nan
+        settings = {key: jobs[0].settings[key] for key in searched}
+        rows.append(
+            {**settings, "mean": per_seed.mean(), "std": spread, "seeds": len(jobs), "steps": steps, "number": number}
+        )
+    table = pd.DataFrame(rows).sort_values(["steps", "mean"], ascending=False, kind="stable")
+    return table.set_index("number")
+
+
+def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
+    """
+    Return against one hyperparameter, as PNG and PDF, at the steps that all candidates have.
+
+    Where others are searched too, each value is represented by its best candidate.
+
+    :param path: without a suffix
+    """
+    from matplotlib.figure import Figure
+
+    shortest = min(read_returns(jobs).shape[1] for jobs in candidates)
+    best: dict[float, np.ndarray] = {}
+    for jobs in candidates:
+        value, scores = jobs[0].settings[key], read_returns(jobs)[:, :shortest].mean(axis=1)
+        if value not in best or scores.mean() > best[value].mean():
+            best[value] = scores
+    job = candidates[0][0]
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    name = "λ" if key == "lam" else key
+    draw_sweep(
+        axes, sorted(best), [best[value] for value in sorted(best)], job.env_id, name, COLORS.get(job.algo.upper())
+    )
+    axes.set_ylabel(f"mean return until step {shortest * eval_freq(job.n_timesteps):,}")
+    for suffix in (".png", ".pdf"):
+        figure.savefig(f"{path}{suffix}")
+
+
+def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> None:
+    """Print the table; write it, the figures, and the hyperparameters of the best."""
+    table = rank(candidates, searched)
+    table.to_csv(folder / "ranking.csv", index=False)
+    print(table.to_string(index=False, float_format=lambda x: f"{x:g}", na_rep="–"))
+    for key in searched:
+        values = {jobs[0].settings[key] for jobs in candidates if isinstance(jobs[0].settings[key], (int, float))}
+        if len(values) > 1 and (table["steps"] > 0).all():
+            draw(candidates, key, folder / key)
+    best = candidates[int(table.index[0])][0]
+    entry, _ = read_entry(hyperparams_file(best.algo), best.env_id)
+    content = {best.env_id: {**entry, **best.settings}}  # with the steps of a whole training
+    (folder / "best.yml").write_text(plain_yaml.dump(content, sort_keys=False))
+    print(f"Ranking, figures and the best hyperparameters are in {folder}")
+    packages = ["--gym-packages", *best.packages] if best.packages else []
+    arguments = ["--algo", best.algo, "--env", best.env_id, "-conf", folder / "best.yml", *packages]
+    print(f"  {command('train', *arguments)}")

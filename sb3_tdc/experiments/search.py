@@ -1,0 +1,66 @@
+"""The candidates of a search, checked before anything is trained."""
+
+import argparse
+from contextlib import closing
+from typing import Any
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.envs.make import SETUP_ERRORS, check_env_id, make_envs
+from sb3_tdc.experiments.jobs import Job, count_cores
+from sb3_tdc.experiments.search_space import LAMBDAS, make_candidates, parse_space
+from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
+
+
+def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
+    """
+    Make the jobs of every candidate.
+
+    :return: for every candidate, its seeds
+    :raises ValueError: for anything that is not allowed
+    """
+    for name in ("n_timesteps", "seeds", "samples", "jobs"):
+        value = getattr(args, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{'-n' if name == 'n_timesteps' else f'--{name}'} must be at least 1, got {value}")
+    check_env_id(args.env)
+    space = parse_space(args.search)
+    if not space:
+        if "lam" not in constructor_hints(ALGORITHMS[args.algo]):
+            raise ValueError(f"{args.algo} has no λ: say what to --search")
+        space = {"lam": LAMBDAS}
+    args.searched = list(space)
+    candidates = make_candidates(space, args.samples)
+    for candidate in candidates:
+        check(args.algo, args.env, {**args.hyperparams, **candidate})
+    n_cpus = args.jobs or count_cores()
+    if args.asha and args.address is None and args.seeds > n_cpus:
+        raise ValueError(
+            f"--asha compares candidates by all their seeds, side by side: {args.seeds} seeds need as many CPUs, "
+            f"there are {n_cpus} (--seeds {n_cpus}, or --jobs {args.seeds} to share them)"
+        )
+
+    def job(number: int, candidate: dict[str, Any], seed: int) -> Job:
+        logs = args.folder / f"candidate_{number}" / f"seed_{seed}"
+        settings, packages = {**args.hyperparams, **candidate}, tuple(args.gym_packages)
+        return Job(args.algo, args.env, seed, args.n_timesteps, logs, settings, packages)
+
+    return [
+        [job(number, candidate, seed) for seed in range(1, args.seeds + 1)]
+        for number, candidate in enumerate(candidates, start=1)
+    ]
+
+
+def check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
+    """
+    Check that the algorithm takes the hyperparameters of a candidate.
+
+    :raises ValueError: if the algorithm does not take them
+    """
+    entry, _ = read_entry(hyperparams_file(algo), env_id)
+    parse({"n_timesteps": 1, **settings}, ALGORITHMS[algo], "--search and -params")
+    hyperparams = parse({**entry, **settings}, ALGORITHMS[algo], "--search and -params")
+    try:
+        with closing(make_envs(env_id, hyperparams, seed=1, n_envs=hyperparams.n_envs)) as env:
+            ALGORITHMS[algo](env=env, device="cpu", **{**hyperparams.model, "buffer_size": 1_000})
+    except SETUP_ERRORS as error:
+        raise ValueError(f"--search and -params: {' '.join(str(error).split())}") from error

@@ -1,0 +1,136 @@
+"""
+Returns of runs → the numbers of tables and figures: functions of arrays that read no file.
+
+Axes are stated in this order: runs (seeds), then bins or tasks, then episodes. A run is one seed, and the unit of
+every interval: episodes of one run say nothing about the next seed. NaN stands for "cannot be known".
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy import integrate, stats
+
+
+def bin_edges(last_step: int, width: int) -> np.ndarray:
+    """Return (bins + 1,), multiples of ``width`` from 0 to the first that is at least ``last_step``."""
+    if last_step < 1 or width < 1:
+        raise ValueError(f"last_step and width must be at least 1, got {last_step} and {width}")
+    return np.arange(0, -(-last_step // width) + 1) * width
+
+
+def bin_means(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """
+    The mean of the values in every bin (edges[b], edges[b+1]]: step 20,000 belongs to the first 20,000.
+
+    :param steps: (n,)
+    :param values: (n,)
+    :param edges: (bins + 1,), increasing
+    :return: (bins,), NaN where a bin is empty
+    """
+    inside = np.isfinite(values)
+    index = np.searchsorted(edges, steps[inside], side="left") - 1
+    kept = (index >= 0) & (index < len(edges) - 1)
+    index, values = index[kept], values[inside][kept]
+    counts = np.bincount(index, minlength=len(edges) - 1)
+    sums = np.bincount(index, weights=values, minlength=len(edges) - 1)
+    return np.divide(sums, counts, out=np.full(len(counts), np.nan), where=counts > 0)
+
+
+def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Mean over runs and its confidence interval by Student's t, which is honest for the few seeds of RL.
+
+    :param values: (runs, ...); NaN is left out
+    :return: mean, low, high, each (...); the interval is NaN where there are fewer than two runs
+    """
+    n = np.isfinite(values).sum(axis=0)
+    mean = np.divide(np.nansum(values, axis=0), n, out=np.full(n.shape, np.nan), where=n > 0)
+    squares = np.nansum((values - mean) ** 2, axis=0)
+    variance = np.divide(squares, n - 1, out=np.full(n.shape, np.nan), where=n > 1)
+    half = stats.t.ppf((1 + confidence) / 2, np.maximum(n - 1, 1)) * np.sqrt(variance / np.maximum(n, 1))
+    return mean, mean - half, mean + half
+
+
+def final_return(returns: np.ndarray) -> float:
+    """
+    Return the mean of the last evaluation of one run.
+
+    :param returns: (evaluations, episodes) of one run
+    """
+    return float(returns[-1].mean())
+
+
+def best_return(returns: np.ndarray) -> float:
+    """
+    The mean of the best evaluation of one run. A maximum over noisy means: it flatters, the more the fewer episodes.
+
+    :param returns: (evaluations, episodes)
+    """
+    return float(returns.mean(axis=1).max())
+
+
+def area_under_curve(steps: np.ndarray, returns: np.ndarray) -> float:
+    """
+    Mean height of the learning curve of one run, by the trapezoidal rule between its first and last evaluation.
+
+    :param steps: (evaluations,), increasing
+    :param returns: (evaluations, episodes)
+    :return: in units of return; of a single evaluation, its mean
+    """
+    means = returns.mean(axis=1)
+    return float(integrate.trapezoid(means, steps) / (steps[-1] - steps[0])) if len(steps) > 1 else float(means[0])
+
+
+def spread(values: np.ndarray) -> float:
+    """
+    Return the sample standard deviation across seeds; NaN for fewer than two.
+
+    :param values: (runs,)
+    """
+    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
+def interquartile_mean(*tasks: np.ndarray, axis: int = -1) -> np.ndarray:
+    """
+    Mean of the middle half of the scores of all runs on all tasks; of fewer than four scores, that of all.
+
+    :param tasks: each (..., runs) along ``axis``
+    """
+    return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
+
+
+def iqm_interval(
+    tasks: Sequence[np.ndarray], seed: int = 0, confidence: float = 0.95, resamples: int = 5_000
+) -> tuple[float, float]:
+    """
+    Stratified bootstrap of the interquartile mean: seeds are resampled within every task (percentile method).
+
+    Of a handful of seeds, resampling knows only those: the interval is then rather too narrow.
+
+    :param tasks: for every task (runs,) scores
+    :param seed: of the resampling
+    :return: low, high; NaN if a task has fewer than two runs
+    """
+    if min(map(len, tasks)) < 2:
+        return float("nan"), float("nan")
+    result = stats.bootstrap(
+        tuple(tasks),
+        interquartile_mean,
+        n_resamples=resamples,
+        confidence_level=confidence,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def normalise_scores(returns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """
+    Scores that can be averaged over tasks: 0 and 1 are the lowest and the highest single run on the task.
+
+    :param returns: of one task, for every algorithm (runs,)
+    :return: the same, between 0 and 1; all 0.5 if all runs are equal
+    """
+    pooled = np.concatenate(list(returns.values()))
+    low, width = pooled.min(), np.ptp(pooled)
+    return {name: (r - low) / width if width > 0 else np.full(len(r), 0.5) for name, r in returns.items()}

@@ -1,0 +1,169 @@
+"""Tables: groups of runs → numbers (for CSV) → cells to read (for the report)."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.experiments import statistics
+from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
+from sb3_tdc.experiments.results import Group, Run
+
+TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
+_PUBLISHED = Path(__file__).with_name("published.yml")
+
+
+def final_returns(runs: Sequence[Run]) -> np.ndarray:
+    """Return the mean of the last evaluation of every run, (runs,)."""
+    return np.array([statistics.final_return(run.evaluations.returns) for run in runs if run.evaluations])
+
+
+def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
+    """One row for each group with a finished run, in units of return; NaN where one seed says nothing."""
+    rows = []
+    for group in groups:
+        curves = [run.evaluations for run in group.finished if run.evaluations]
+        if not curves:
+            continue
+        final = final_returns(group.finished)
+        best = np.array([statistics.best_return(curve.returns) for curve in curves])
+        area = np.array([statistics.area_under_curve(curve.timesteps, curve.returns) for curve in curves])
+        low, high = statistics.iqm_interval([final])
+        tested = [returns for run in group.finished if (returns := read_test_returns(run)) is not None]
+        tests = np.array([returns.mean() for returns in tested])
+        rows.append(
+            {
+                "environment": group.env_id,
+                "algorithm": group.label,
+                "steps": group.n_timesteps,
+                "seeds": len(curves),
+                "episodes": curves[0].returns.shape[1],
+                "final_mean": final.mean(),
+                "final_std": statistics.spread(final),
+                "final_min": final.min(),
+                "final_max": final.max(),
+                "final_iqm": statistics.interquartile_mean(final),
+                "final_iqm_low": low,
+                "final_iqm_high": high,
+                "best_mean": best.mean(),
+                "best_std": statistics.spread(best),
+                "area_mean": area.mean(),
+                "area_std": statistics.spread(area),
+                "test_mean": tests.mean() if len(tests) else np.nan,
+                "test_std": statistics.spread(tests) if len(tests) else np.nan,
+                "test_seeds": len(tests),
+                "test_episodes": min(map(len, tested), default=0),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def show_returns(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table of numbers as cells to read."""
+    rows = []
+    for row in table.to_dict("records"):
+        interval = (
+            f"{number(row['final_iqm'])} [{number(row['final_iqm_low'])}, {number(row['final_iqm_high'])}]"
+            if row["seeds"] > 1
+            else "–"
+        )
+        test = plus_minus(row["test_mean"], row["test_std"])
+        if row["test_seeds"] < row["seeds"] or row["test_episodes"] < EPISODES:
+            test += f" ({row['test_seeds']} of {row['seeds']} seeds, {row['test_episodes']} episodes)"
+        rows.append(
+            {
+                "Environment": row["environment"],
+                "Algorithm": row["algorithm"],
+                "Steps": number(row["steps"]),
+                "Seeds": row["seeds"],
+                "Final": plus_minus(row["final_mean"], row["final_std"]),
+                "IQM [95 %]": interval,
+                "Lowest, highest seed": f"{number(row['final_min'])}, {number(row['final_max'])}",
+                "Best": plus_minus(row["best_mean"], row["best_std"]),
+                "Mean of the curve": plus_minus(row["area_mean"], row["area_std"]),
+                "Test": test if row["test_seeds"] else "–",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
+    """
+    Our final returns, then what others have published, one row for each source and algorithm.
+
+    :param table: of :func:`make_returns_table`
+    """
+    rows = []
+    ours = [row for row in table.to_dict("records") if row["environment"].rpartition("-")[0] in TASKS]
+    for (algorithm, version), some in _grouped(ours).items():
+        by_task = {row["environment"].rpartition("-")[0]: row for row in some}
+        rows.append(
+            {
+                "Algorithm": f"{algorithm}: this report",
+                **{
+                    task: plus_minus(by_task[task]["final_mean"], by_task[task]["final_std"])
+                    if task in by_task
+                    else "–"
+                    for task in TASKS
+                },
+                "Environments": version,
+                "Steps": _per_task({task: number(row["steps"]) for task, row in by_task.items()}),
+                "Seeds": _per_task({task: str(row["seeds"]) for task, row in by_task.items()}),
+                "What": "mean of the last evaluation ± std over seeds",
+            }
+        )
+    published = plain_yaml.load(_PUBLISHED.read_text(), _PUBLISHED.name)
+    for entry in published:
+        for algorithm, returns in entry["returns"].items():
+            note = entry.get("notes", {}).get(algorithm)
+            steps = entry["steps"] if isinstance(entry["steps"], dict) else dict.fromkeys(TASKS, entry["steps"])
+            rows.append(
+                {
+                    "Algorithm": f"{algorithm}: {entry['source']}",
+                    **{task: _published_return(returns.get(task)) for task in TASKS},
+                    "Environments": entry["version"],
+                    "Steps": _per_task({task: f"{steps[task]:g}M" for task in TASKS}),
+                    "Seeds": str(entry["seeds"]),
+                    "What": f"{entry['how']} ({note})" if note else entry["how"],
+                }
+            )
+    names = [re.split("[,:]|-λ", row["Algorithm"])[0] for row in rows]
+    order = sorted(range(len(rows)), key=lambda i: names.index(names[i]))  # stable: ours comes first
+    return pd.DataFrame([rows[i] for i in order])
+
+
+def number(value: float) -> str:
+    """Thousands separated; one decimal below 100; "–" for NaN."""
+    if np.isnan(value):
+        return "–"
+    text = f"{value:,.1f}" if abs(value) < 100 and value != int(value) else f"{value:,.0f}"
+    return text.replace("-", "−")
+
+
+def plus_minus(mean: float, std: float) -> str:
+    """``"1,234 ± 56"``, without a ± of one seed."""
+    return number(mean) if np.isnan(std) else f"{number(mean)} ± {number(std)}"
+
+
+def _published_return(value: Any) -> str:
+    if value is None:
+        return "–"
+    return plus_minus(*value) if isinstance(value, list) else number(value)
+
+
+def _per_task(values: dict[str, str]) -> str:
+    """One value if all tasks that have one have the same, else those of all, in the order of the columns."""
+    if len(set(values.values())) == 1:
+        return next(iter(values.values()))
+    return " / ".join(values.get(task, "–") for task in TASKS)
+
+
+def _grouped(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["algorithm"], row["environment"].rpartition("-")[2]), []).append(row)
+    return groups

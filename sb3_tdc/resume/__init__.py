@@ -1,0 +1,17 @@
+"""Exact, crash-safe continuation of runs of SB3's off-policy algorithms (docs/resume.md)."""
+
+from sb3_tdc.resume.callback import DEFAULT_FREQ, ResumeStates
+from sb3_tdc.resume.restorable import Restorable
+from sb3_tdc.resume.store import BrokenStateError, LockedError, stored_steps
+from sb3_tdc.resume.walk import NotCapturedError, NotRestoredError
+
+__all__ = [
+    "DEFAULT_FREQ",
+    "BrokenStateError",
+    "LockedError",
+    "NotCapturedError",
+    "NotRestoredError",
+    "Restorable",
+    "ResumeStates",
+    "stored_steps",
+]

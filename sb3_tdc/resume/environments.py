@@ -1,0 +1,199 @@
+"""Vectorised environments, and each environment with all of its wrappers, captured in the middle of an episode."""
+
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from sb3_tdc.resume.event_files import capture_event_files, restore_event_files
+from sb3_tdc.resume.kinds.generators import GENERATORS
+from sb3_tdc.resume.locations import Locations
+from sb3_tdc.resume.walk import (
+    MISSING,
+    Capture,
+    Kinds,
+    NotRestoredError,
+    Restore,
+    attributes_of,
+    existing_as,
+    uncovered,
+)
+
+
+def capture_env(kinds: Kinds, env: gym.Env) -> dict[str, Any]:
+    """
+    Capture one environment with all of its wrappers.
+
+    :return: of plain values and arrays: generators and the ``Monitor``, so that these continue whatever else does not;
+        then the environment, or why it cannot be captured
+    """
+    monitors = _monitors(env)
+    context = Capture(kinds, _known(monitors))
+    generators = {
+        name: {a: value for a, value in attributes_of(owner).items() if isinstance(value, GENERATORS)}
+        for name, owner in _owners(env).items()
+    }
+    content: dict[str, Any] = {
+        "generators": {n: context.capture_attributes(g, n, optional=True) for n, g in generators.items()},
+        "monitors": [context.capture_attributes(_without_env(m), "Monitor", optional=True) for m in monitors],
+    }
+    whole = context.capture_optional([env, *(monitor.env for monitor in monitors)], "env")
+    why = context.left_out[-1] if whole is MISSING else None
+    content["whole"] = whole if why is None else None
+    shared = context.shared_memory()
+    return {
+        "why": why,
+        "content": content,
+        "arrays": context.arrays,
+        "left_out": context.left_out,
+        "shared": shared,
+        "texts": context.texts,
+    }
+
+
+def restore_env(
+    kinds: Kinds, env: gym.Env, state: dict[str, Any], with_files: bool, locations: Locations
+) -> str | None:
+    """
+    Restore what :func:`capture_env` has captured.
+
+    :param with_files: restore files too
+    :param locations: with the texts that this environment was built with
+    :return: None, or why the episode has to be started again
+    """
+    if state["content"] is None:
+        return state["why"]
+    monitors = _monitors(env)
+    context = Restore(kinds, state["arrays"], _known(monitors), with_files=with_files, locations=locations)
+    for name, owner in _owners(env).items():
+        nodes = state["content"]["generators"].get(name, {})
+        context.restore_attributes(nodes, owner, name, optional=True)
+    for monitor, attributes in zip(monitors, state["content"]["monitors"], strict=False):
+        context.restore_attributes(attributes, monitor, "Monitor", optional=True)
+    if state["why"] is not None:
+        return state["why"]
+    try:
+        context.restore(state["content"]["whole"], [env, *(monitor.env for monitor in monitors)], "env")
+    except Exception as error:
+        return str(error) if isinstance(error, NotRestoredError) else f"{type(error).__name__}: {error}"
+    return next(iter(context.not_restored), None)
+
+
+def _monitors(env: gym.Env) -> list[Monitor]:
+    return [layer for layer in _layers(env) if isinstance(layer, Monitor)]
+
+
+def _layers(env: gym.Env) -> list[gym.Env]:
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    return layers
+
+
+def _known(monitors: list[Monitor]) -> dict[str, Any]:
+    return {f"monitor {i}": monitor for i, monitor in enumerate(monitors)}
+
+
+def _without_env(monitor: Monitor) -> dict[str, Any]:
+    return {name: value for name, value in attributes_of(monitor).items() if name != "env"}
+
+
+def _owners(env: gym.Env) -> dict[str, Any]:
+    """Return what has generators: an environment, its wrappers, and their spaces."""
+    layers = {f"env{'.env' * i}": layer for i, layer in enumerate(_layers(env))}
+    spaces = ("action_space", "observation_space")
+    parts = {f"{name}.{space}": vars(layer).get(space) for name, layer in layers.items() for space in spaces}
+    return {name: owner for name, owner in (layers | parts).items() if owner is not None}
+
+
+# ---------------------------------------------------------------- vectorised environments
+
+
+def is_vec_env(value: Any) -> bool:
+    """Return whether a value has the environments."""
+    return isinstance(value, (DummyVecEnv, SubprocVecEnv))
+
+
+def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
+    """Return every environment, in this process or its own."""
+    if isinstance(env, DummyVecEnv):
+        states = [capture_env(context.kinds, single) for single in env.envs]
+    elif env.has_attr("capture_state"):
+        states = env.env_method("capture_state")
+    else:
+        why = f"{path} is a SubprocVecEnv: wrap its environments in sb3_tdc.resume.Restorable (wrapper_class)"
+        nothing: dict[str, Any] = {
+            "why": why,
+            "content": None,
+            "arrays": [],
+            "left_out": [why],
+            "shared": {},
+            "texts": {},
+        }
+        states = [nothing] * env.num_envs
+    captured = []
+    for i, state in enumerate(states):
+        context.first_arrays[f"{path}, environment {i}"] = len(context.arrays)
+        _tell_what_is_not_covered(context, state, f"{path}, environment {i}")
+        numbers = [context.add_array(array) for array in state["arrays"]]
+        captured.append({"why": state["why"], "content": state["content"], "arrays": numbers})
+    return [captured, context.capture_attributes(_own_attributes(env), path)]
+
+
+def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str) -> None:
+    context.left_out += state["left_out"]
+    context.texts |= {f"{path}: {name}": text for name, text in state["texts"].items()}
+    context.shared_elsewhere |= {f"{path}: {group}": f"{path}: {paths}" for group, paths in state["shared"].items()}
+    if state["why"] is not None:
+        return
+    whole = context.attributes[path] = state["content"]["whole"]
+    if context.initial is not None:
+        missing = uncovered(context.kinds, whole, context.initial.attributes.get(path), path)
+        context.left_out += [f"{why}: its episode will begin again" for why in missing]
+
+
+def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Give every environment its state, and note those whose episode has to start again."""
+    env = existing_as((DummyVecEnv, SubprocVecEnv), existing, path)
+    captured, attributes = content
+    if len(captured) != env.num_envs:
+        raise NotRestoredError(f"{path} had {len(captured)} environments, and has {env.num_envs}")
+    states = [{**state, "arrays": [context.array(number) for number in state["arrays"]]} for state in captured]
+    built = [context.locations.below(f"{path}, environment {i}: ") for i in range(len(states))]
+    arguments = [(state, context.with_files, locations) for state, locations in zip(states, built, strict=True)]
+    if isinstance(env, DummyVecEnv):
+        whys = [restore_env(context.kinds, single, *each) for single, each in zip(env.envs, arguments, strict=True)]
+    elif env.has_attr("restore_state"):
+        whys = [env.env_method("restore_state", *each, indices=i)[0] for i, each in enumerate(arguments)]
+    else:
+        whys = [state["why"] or "there is no sb3_tdc.resume.Restorable around it" for state in states]
+    context.restarted += [f"{path}, environment {i}: {why}" for i, why in enumerate(whys) if why is not None]
+    context.restore_attributes(attributes, env, path)
+    return existing
+
+
+def is_event_files(value: Any) -> bool:
+    """Return whether a value writes event files."""
+    return isinstance(value, TensorBoardOutputFormat)
+
+
+def capture_output(context: Capture, value: TensorBoardOutputFormat, path: str) -> Any:
+    """Return how far the event files go."""
+    return context.capture(capture_event_files(value), path)
+
+
+def restore_output(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Cut event files to what they were."""
+    output = existing_as(TensorBoardOutputFormat, existing, path)
+    state = context.restore(content, MISSING, path)
+    if context.with_files:
+        restore_event_files(output, state, context.step, context.locations)
+    return output
+
+
+def _own_attributes(env: VecEnv) -> dict[str, Any]:
+    """What else there is is overwritten by every step."""
+    names = ("observation_space", "action_space", "_seeds", "_options")
+    return {name: vars(env)[name] for name in names}

@@ -1,0 +1,83 @@
+"""TensorBoard's event files: cut back to where they were, and continued in a new one without a gap or a duplicate."""
+
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+from sb3_tdc.resume.locations import Locations
+
+
+def capture_event_files(output: TensorBoardOutputFormat) -> dict[str, Any]:
+    """Return the folder and the size of every event file in it, in bytes."""
+    output.writer.flush()
+    folder = Path(output.writer.log_dir)
+    sizes = {}
+    for path in _event_files(folder):
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+        sizes[path.name] = path.stat().st_size
+    return {"folder": os.path.abspath(folder), "sizes": sizes}
+
+
+def restore_event_files(
+    output: TensorBoardOutputFormat, state: dict[str, Any], step: int, locations: Locations
+) -> None:
+    """
+    Drop what this process has written so far, and what was written after the state was captured.
+
+    The files stay in their folder. If that is outside the run's folder and this run is a copy, it belongs to the
+    original: the copy continues with copies of the files, in the folder that was made for this process.
+
+    :param step: a TensorBoard that watches is told to forget what it has seen beyond
+    """
+    from torch.utils.tensorboard.writer import SummaryWriter
+
+    output.writer.close()
+    opened, folder = Path(output.writer.log_dir), Path(state["folder"])
+    if not folder.is_dir():
+        folder = opened
+    if not folder.samefile(opened):  # made for this process
+        for path in _event_files(opened):
+            path.unlink()
+        if locations.is_copy and not locations.contains(folder):
+            for name in state["sizes"]:
+                shutil.copy2(folder / name, opened / name)
+            folder = opened
+        else:
+            with suppress(OSError):
+                opened.rmdir()
+    for path in _event_files(folder):
+        if path.name not in state["sizes"]:
+            path.unlink()
+        elif path.stat().st_size > state["sizes"][path.name]:
+            os.truncate(path, state["sizes"][path.name])
+    with _named_after(state["sizes"]):
+        output.writer = SummaryWriter(str(folder), purge_step=step + 1)
+
+
+@contextmanager
+def _named_after(names: Iterable[str]) -> Iterator[None]:
+    """
+    Let an event file that is opened in this block come after others in the order of names, in which they are read.
+
+    The names begin with the second in which a file was opened: the clock may have been set back since, or be the same.
+    """
+    from tensorboard.summary.writer import event_file_writer
+
+    found = [re.match(r"events\.out\.tfevents\.(\d+)", name) for name in names]
+    second = max([time.time(), *(int(match[1]) + 1 for match in found if match)])
+    with mock.patch.object(event_file_writer, "time", SimpleNamespace(time=lambda: second)):
+        yield
+
+
+def _event_files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("events.out.tfevents.*"))

@@ -1,0 +1,263 @@
+"""Arrays, tensors and the values that JSON does not know; an existing array keeps its memory."""
+
+import datetime
+import decimal
+import fractions
+import pathlib
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_tdc.resume.kinds.containers import capture_items, items_of, restore_items
+from sb3_tdc.resume.walk import MISSING, Capture, NotCapturedError, NotRestoredError, Restore, existing_as
+
+# ---------------------------------------------------------------- arrays
+
+
+def run_lengths(array: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return starts and values of the runs of equal numbers, where that is much smaller; else None."""
+    if array.dtype.kind not in "biu" or array.size <= 4096:
+        return None
+    flat = array.ravel()
+    starts = np.flatnonzero(np.concatenate(([True], flat[1:] != flat[:-1])))
+    return (starts, flat[starts]) if len(starts) < array.size // 8 else None
+
+
+def capture_array(context: Capture, value: np.ndarray, path: str) -> Any:
+    """Return the numbers, and which part of which memory they are."""
+    if value.dtype.kind == "O":
+        return {"shape": list(value.shape), "items": capture_items(context, list(value.flat), path)}
+    if value.dtype.hasobject:
+        raise NotCapturedError(f"{path} is an array of {value.dtype}")
+    if is_native_memory(value):
+        return {"native": list(value.shape)}  # of an object that is captured itself
+    content: dict[str, Any] = {"memory": _memory_of(context, value, path), "part": _part(value)}
+    if (runs := run_lengths(value)) is not None:
+        return content | {"runs": [context.add_array(part) for part in runs], "shape": list(value.shape)}
+    return content | {"array": context.add_array(np.array(value))}
+
+
+def restore_array(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Fill an array, in place where one of the same part of its memory is there."""
+    if "native" in content:
+        existing = existing_as(np.ndarray, existing, path)
+        if not is_native_memory(existing) or list(existing.shape) != content["native"]:
+            raise NotRestoredError(f"{path} was a view of native memory, of shape {content['native']}")
+        return existing
+    if "items" in content:
+        return _restore_objects(context, content, existing, path)
+    if "runs" in content:
+        starts, numbers = (context.array(part) for part in content["runs"])
+        counts = np.diff(starts, append=int(np.prod(content["shape"])))
+        value = np.repeat(numbers, counts).reshape(content["shape"])
+    else:
+        value = context.array(content["array"]).copy(order="K")
+    if not _fits(existing, value, content) or not context.claims_memory(content["memory"], _address(existing)):
+        return value
+    existing[...] = value
+    return existing
+
+
+def needs_of_array(content: Any) -> str | None:
+    """Return the shape of an array in native memory, which has to be there."""
+    return f"a view of native memory, of shape {content['native']}" if "native" in content else None
+
+
+def children_of_array(content: Any) -> dict[str, Any]:
+    """Return the items of an array of objects."""
+    return items_of(content.get("items", []))
+
+
+def _restore_objects(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    is_there = type(existing) is np.ndarray and existing.dtype == object and list(existing.shape) == content["shape"]
+    value = existing if is_there and context.claims(existing) else np.empty(content["shape"], dtype=object)
+    context.begin(value)
+    items = restore_items(context, content["items"], list(existing.flat) if is_there else [], path)
+    for i, item in enumerate(items):
+        value.flat[i] = item
+    return value
+
+
+def _fits(existing: Any, value: np.ndarray, content: Any) -> bool:
+    is_array = type(existing) is np.ndarray and existing.dtype == value.dtype and existing.shape == value.shape
+    return (
+        is_array and existing.flags.writeable and not is_native_memory(existing) and _part(existing) == content["part"]
+    )
+
+
+def is_native_memory(array: np.ndarray) -> bool:
+    """Return whether the memory belongs to an object that numpy does not know."""
+    base = _root(array).base
+    return base is not None and not isinstance(base, (bytes, bytearray, memoryview, th.Tensor))
+
+
+def _root(array: np.ndarray) -> np.ndarray:
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array
+
+
+def _address(array: np.ndarray) -> int:
+    return _root(array).__array_interface__["data"][0]
+
+
+def _part(array: np.ndarray) -> list[Any] | None:
+    """Return None for the whole of a memory, else where in it, and how."""
+    if array.base is None:
+        return None
+    return [array.__array_interface__["data"][0] - _address(array), list(array.strides)]
+
+
+def _memory_of(context: Capture, array: Any, path: str) -> int:
+    """Return the number of the memory in this capture."""
+    is_tensor = isinstance(array, th.Tensor)
+    size = array.numel() if is_tensor else array.size
+    address = array.untyped_storage().data_ptr() if is_tensor else _address(array)
+    part = [str(array.dtype), list(array.shape), None if is_tensor else _part(array)]
+    return context.note_memory(address if size else None, path, part)
+
+
+# ---------------------------------------------------------------- tensors
+
+
+def is_tensor(value: Any) -> bool:
+    """Return whether it is a tensor, or a parameter, and not of a class derived from these."""
+    return type(value) in (th.Tensor, nn.Parameter)
+
+
+def capture_tensor(context: Capture, value: th.Tensor, path: str) -> Any:
+    """Return the numbers, the gradient, the device."""
+    if value.grad_fn is not None or vars(value):
+        raise NotCapturedError(f"{path} is a tensor with {'attributes' if vars(value) else 'a history of gradients'}")
+    try:
+        array = value.detach().cpu().numpy().copy()
+    except (TypeError, RuntimeError) as error:
+        raise NotCapturedError(f"{path} is a tensor of {value.dtype}, {value.layout}") from error
+    return {
+        "array": context.add_array(array),
+        "memory": _memory_of(context, value, path),
+        "parameter": type(value) is nn.Parameter,
+        "requires_grad": value.requires_grad,
+        "device": str(value.device),
+        "gradient": context.capture(value.grad, f"{path}.grad"),
+    }
+
+
+def restore_tensor(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Fill a tensor, in place where one of this shape and type is there."""
+    value = th.from_numpy(context.array(content["array"]).copy())
+    kind = nn.Parameter if content["parameter"] else th.Tensor
+    fits = type(existing) is kind and existing.shape == value.shape and existing.dtype == value.dtype
+    fits = fits and existing.is_leaf and existing.is_contiguous()
+    if fits and context.claims_memory(content["memory"], existing.untyped_storage().data_ptr()):
+        existing.detach().copy_(value)
+    else:
+        device = existing.device if isinstance(existing, th.Tensor) else th.device(content["device"])
+        value = value.to(device if device.type == "cpu" or th.cuda.is_available() else "cpu")
+        existing = nn.Parameter(value, requires_grad=False) if content["parameter"] else value
+    existing.requires_grad_(content["requires_grad"])
+    existing.grad = context.restore(content["gradient"], existing.grad, f"{path}.grad")
+    return existing
+
+
+# ---------------------------------------------------------------- bytes, numbers, and values made from others
+
+
+def capture_number(context: Capture, value: Any, path: str) -> Any:
+    """Return numpy's scalar as an array."""
+    array = np.array(value)
+    if array.dtype.hasobject or type(array[()]) is not type(value) or array.tobytes() != np.asarray(value).tobytes():
+        raise NotCapturedError(f"{path} is a {type(value).__name__} of {array.dtype}")
+    if array.dtype.kind in "US" and array[()] != value:  # numpy drops the zeros at the end
+        raise NotCapturedError(f"{path} is a text that numpy does not keep whole")
+    return context.add_array(array)
+
+
+def capture_bytes(context: Capture, value: Any, path: str) -> Any:
+    """Return an array of the bytes."""
+    return context.add_array(np.frombuffer(bytes(value), dtype=np.uint8))
+
+
+def restore_bytes(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Return new bytes."""
+    return context.array(content).tobytes()
+
+
+def restore_bytearray(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Fill an array of bytes, in place where there is one."""
+    value = existing if type(existing) is bytearray and context.claims(existing) else bytearray()
+    value[:] = context.array(content).tobytes()
+    return value
+
+
+def _torch_type(name: str) -> th.dtype:
+    found = vars(th).get(name)
+    if not isinstance(found, th.dtype):
+        raise NotRestoredError(f"There is no torch.{name}")
+    return found
+
+
+# Immutable values by name: their class, what they are made from, and how
+_MADE: dict[str, tuple[type, Callable[[Any], list[Any]], Callable[..., Any]]] = {
+    "complex": (complex, lambda v: [v.real, v.imag], complex),
+    "range": (range, lambda v: [v.start, v.stop, v.step], range),
+    "slice": (slice, lambda v: [v.start, v.stop, v.step], slice),
+    "PosixPath": (pathlib.PosixPath, lambda v: [str(v)], pathlib.Path),
+    "WindowsPath": (pathlib.WindowsPath, lambda v: [str(v)], pathlib.Path),
+    "PurePosixPath": (pathlib.PurePosixPath, lambda v: [str(v)], pathlib.PurePosixPath),
+    "PureWindowsPath": (pathlib.PureWindowsPath, lambda v: [str(v)], pathlib.PureWindowsPath),
+    "timedelta": (datetime.timedelta, lambda v: [v.days, v.seconds, v.microseconds], datetime.timedelta),
+    "datetime": (datetime.datetime, lambda v: [v.isoformat()], datetime.datetime.fromisoformat),
+    "date": (datetime.date, lambda v: [v.isoformat()], datetime.date.fromisoformat),
+    "decimal": (decimal.Decimal, lambda v: [str(v)], decimal.Decimal),
+    "fraction": (fractions.Fraction, lambda v: [v.numerator, v.denominator], fractions.Fraction),
+    "uuid": (uuid.UUID, lambda v: [str(v)], uuid.UUID),
+    "numpy's type": (np.dtype, lambda v: [v.str], np.dtype),
+    "torch's type": (th.dtype, lambda v: [str(v).removeprefix("torch.")], _torch_type),
+    "device": (th.device, lambda v: [str(v)], th.device),
+}
+
+
+def is_made(value: Any) -> bool:
+    """Return whether a value can be made from a few others."""
+    return _row(value) is not None
+
+
+def _row(value: Any) -> str | None:
+    kinds = (name for name, (kind, *_) in _MADE.items() if type(value) is kind)
+    return next(kinds, "numpy's type" if isinstance(value, np.dtype) else None)
+
+
+def capture_made(context: Capture, value: Any, path: str) -> Any:
+    """Return the name of the kind, and what it is made from."""
+    name = _row(value)
+    assert name is not None
+    _, parts, make = _MADE[name]
+    again = make(*parts(value))
+    if type(again) is not type(value) or repr(again) != repr(value):
+        raise NotCapturedError(f"{path} is {value!r}")
+    return [name, capture_items(context, parts(value), path)]
+
+
+def restore_made(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Return the value."""
+    name, parts = content
+    if issubclass(_MADE[name][0], pathlib.Path):
+        text = context.restore(parts[0], MISSING, path)
+        there = str(existing) if isinstance(existing, pathlib.PurePath) else MISSING
+        return _MADE[name][2](context.locations.find(text, there, f"{path}[0]", is_path=True))
+    return _MADE[name][2](*restore_items(context, parts, [], path))
+
+
+def restore_integer(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Return an integer that is too large for JSON."""
+    return int(content, 16)
+
+
+def restore_text(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Return a text that JSON cannot hold."""
+    return bytes.fromhex(content).decode("utf-8", "surrogatepass")

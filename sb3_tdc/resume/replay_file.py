@@ -1,0 +1,161 @@
+"""
+The replay buffer's rings in segments: a state writes the transitions added since the last one.
+
+A segment holds consecutive slots of the ring. The ring is that of the segments in the order they were written; one
+whose slots have all been overwritten since is not needed any more. Observations keep the type that the buffer has. A
+next observation that equals the observation of the following slot, bit for bit, is not stored twice.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_tdc.resume.kinds.table import KINDS
+from sb3_tdc.resume.walk import Capture, Restore
+
+# Written to once, when a transition is added. Whatever else a buffer holds is captured whole
+_RINGS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_INFOS = "infos"  # of HER, objects
+# A slot's next observation may be the following slot's observation
+_NEXT, _CURRENT = "next_observations", "observations"
+
+
+@dataclass(frozen=True)
+class Segment:
+    """
+    Slots of the replay buffer that are stored in one file.
+
+    :param name: of its file
+    :param first: its first slot
+    :param length: slots, at least 1 and at most the ring's
+    """
+
+    name: str
+    first: int
+    length: int
+
+
+def rings(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
+    """Return the arrays (slots, environments, ...) by name; those of ``Dict`` observations by ``name/key``."""
+    found = {}
+    for name in _RINGS:
+        value = vars(buffer).get(name)
+        parts = value.items() if isinstance(value, dict) else [("", value)]
+        found.update({f"{name}/{key}" if key else name: part for key, part in parts if isinstance(part, np.ndarray)})
+    return found
+
+
+def other_attributes(buffer: ReplayBuffer) -> dict[str, Any]:
+    """Return what is not in the segments, without the environment and the device."""
+    return {name: value for name, value in vars(buffer).items() if name not in (*_RINGS, _INFOS, "env", "device")}
+
+
+def new_segment(buffer: ReplayBuffer, name: str, first: int | None, added: int) -> Segment | None:
+    """
+    Return the slots that have been written since the last segment.
+
+    :param first: the buffer's position at the end of the last segment; None if there is none
+    :param added: slots since then, as the timesteps say
+    :return: the slots to write: all of them if this is not what the buffer says; None if there are none
+    """
+    size = buffer.buffer_size
+    if first is None or not 0 <= added <= size or (first + added) % size != buffer.pos:
+        added = buffer.size()
+    return Segment(name, (buffer.pos - added) % size, added) if added else None
+
+
+def needed(segments: list[Segment], size: int) -> list[Segment]:
+    """Return the segments whose slots have not all been written again."""
+    kept: list[Segment] = []
+    written = np.zeros(size, dtype=bool)
+    for segment in reversed(segments):
+        slots = np.arange(segment.first, segment.first + segment.length) % size
+        if not written[slots].all():
+            kept.insert(0, segment)
+            written[slots] = True
+    return kept
+
+
+def find_non_finite(buffer: ReplayBuffer, segment: Segment) -> list[str]:
+    """Return the names of the rings that hold a NaN or an infinite number among the slots of a segment."""
+    slots = _slots(buffer, segment)
+    floats = {name: ring for name, ring in rings(buffer).items() if ring.dtype.kind == "f"}
+    return [f"replay_buffer.{name}" for name, ring in floats.items() if not np.isfinite(_take(ring, slots)).all()]
+
+
+def write_segment(buffer: ReplayBuffer, segment: Segment) -> Callable[[Path], None]:
+    """Return what writes the file of a segment."""
+
+    def write(path: Path) -> None:
+        slots = _slots(buffer, segment)
+        arrays = {name: _take(ring, slots) for name, ring in rings(buffer).items()}
+        for name in [name for name in arrays if name.startswith(_NEXT)]:
+            current, following = arrays[name.replace(_NEXT, _CURRENT)], arrays.pop(name)
+            differs = np.ones(following.shape[:2], dtype=bool)
+            differs[:-1] = ~_same_bits(following[:-1], current[1:])
+            arrays |= {f"{name}:differs": differs, name: following[differs]}
+        with path.open("wb") as file:
+            np.savez(file, infos=_infos(buffer, slots), **arrays)  # type: ignore[arg-type]
+
+    return write
+
+
+def read_segments(buffer: ReplayBuffer, files: Iterator[tuple[Segment, Path]]) -> None:
+    """Fill the rings; whatever was in them is overwritten, slot by slot."""
+    targets = rings(buffer)
+    for segment, path in files:
+        slots = _slots(buffer, segment)
+        with np.load(path, allow_pickle=False) as stored:
+            for name, ring in targets.items():
+                values = stored[name]
+                if f"{name}:differs" in stored:
+                    differs, different = stored[f"{name}:differs"], values
+                    values = np.roll(stored[name.replace(_NEXT, _CURRENT)], -1, axis=0)
+                    values[differs] = different
+                ring[slots] = values
+            _restore_infos(buffer, slots, stored["infos"])
+
+
+def _slots(buffer: ReplayBuffer, segment: Segment) -> np.ndarray:
+    # With optimize_memory_usage the slot after the last transition holds its next observation
+    length = min(segment.length + int(buffer.optimize_memory_usage), buffer.buffer_size)
+    return np.arange(segment.first, segment.first + length) % buffer.buffer_size
+
+
+def _take(ring: np.ndarray, slots: np.ndarray) -> np.ndarray:
+    """A view where the slots do not go around the end of the ring."""
+    return ring[slots[0] : slots[-1] + 1] if slots[0] <= slots[-1] else ring[slots]
+
+
+def _same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return (slots, environments), whether all bits of the rows are equal (−0 and 0 are not, NaN is itself)."""
+    if a.size == 0:
+        return np.zeros(a.shape[:2], dtype=bool)
+    words = (x.view(f"u{x.itemsize}").reshape(*x.shape[:2], -1) for x in (a, b))
+    return np.equal(*words).all(axis=-1)
+
+
+def _infos(buffer: ReplayBuffer, slots: np.ndarray) -> np.ndarray:
+    """HER's ``copy_info_dict``, as JSON text and its arrays in one array of bytes."""
+    infos = vars(buffer).get(_INFOS)
+    if infos is None or not any(info for row in infos[slots] for info in row):
+        return np.zeros(0, dtype=np.uint8)
+    context = Capture(KINDS)
+    content = context.capture([list(row) for row in infos[slots]], "replay_buffer.infos")
+    arrays = [[array.dtype.str, list(array.shape), array.tobytes().hex()] for array in context.arrays]
+    return np.frombuffer(json.dumps([content, arrays]).encode(), dtype=np.uint8)
+
+
+def _restore_infos(buffer: ReplayBuffer, slots: np.ndarray, stored: np.ndarray) -> None:
+    infos = vars(buffer).get(_INFOS)
+    if infos is None or stored.size == 0:
+        return
+    content, arrays = json.loads(stored.tobytes())
+    context = Restore(KINDS, [np.frombuffer(bytes.fromhex(b), dtype=d).reshape(shape) for d, shape, b in arrays])
+    for slot, row in zip(slots, context.restore(content, None, "replay_buffer.infos"), strict=True):
+        infos[slot] = row

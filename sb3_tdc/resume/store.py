@@ -1,0 +1,305 @@
+"""
+Directories that are there whole or not at all.
+
+``<folder>/step_000000010000/`` holds the files of one state and, written last, ``manifest``: their SHA-256, and
+those of the shared files in ``<folder>/replay/`` that it needs. Everything is written next to its place, synced, and
+renamed.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Writer = Callable[[Path], Any]
+
+_FORMAT = 1
+_MANIFEST = "manifest"
+_SHARED = "replay"
+_STEP = re.compile(r"step_(\d{12,})")
+
+
+class BrokenStateError(ValueError):
+    """A state that is not as it was written; the message says which file."""
+
+
+class LockedError(ValueError):
+    """Another process writes to the folder."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """
+    One state on disk, verified.
+
+    :param step: its timestep
+    :param path: its folder
+    :param shared: SHA-256 of the shared files that it needs, by name
+    """
+
+    step: int
+    path: Path
+    shared: dict[str, str]
+
+    def shared_file(self, name: str) -> Path:
+        """Return the path of a shared file."""
+        return self.path.parent / _SHARED / name
+
+
+def stored_steps(folder: Path) -> list[int]:
+    """Return timesteps of the states in a folder, intact or not, newest first."""
+    found = [_STEP.fullmatch(path.name) for path in folder.glob("step_*")]
+    return sorted((int(match[1]) for match in found if match), reverse=True)
+
+
+class Store:
+    """
+    The states of one run.
+
+    :param folder: made if it is missing
+    :param keep: how many of the newest stay
+    :param span: besides, one stays that is at least this many steps older than the newest, and less than twice as many
+        as soon as there can be one; 0 for none
+    :raises LockedError: if another process writes there
+    """
+
+    def __init__(self, folder: Path, keep: int, span: int):
+        self.folder, self.keep, self.span = folder, keep, span
+        (folder / _SHARED).mkdir(parents=True, exist_ok=True)
+        # Outside the folder: removing the states must not let a second process in
+        self._lock_file = folder.with_name(f"{folder.name}.lock")
+        self._lock = _lock(self._lock_file)
+
+    def close(self) -> None:
+        """Let another process write there."""
+        self._lock.close()
+
+    def open_again(self, shared: Iterable[str]) -> bool:
+        """
+        Make the folder, and take the lock, again if they have been removed.
+
+        :param shared: names of shared files
+        :return: whether these are still there
+        :raises LockedError: if another process writes there by now
+        """
+        (self.folder / _SHARED).mkdir(parents=True, exist_ok=True)
+        if not _is_file_at(self._lock, self._lock_file):
+            lock = _lock(self._lock_file)
+            self._lock.close()
+            self._lock = lock
+        return all((self.folder / _SHARED / name).is_file() for name in shared)
+
+    def steps(self) -> list[int]:
+        """Return the steps of all states, intact or not, newest first."""
+        return stored_steps(self.folder)
+
+    def newest(self) -> Stored | None:
+        """
+        Verify and return the newest intact state.
+
+        :return: the newest intact state, or None if there is none at all; broken ones are named in a warning
+        :raises BrokenStateError: if there are some, and none is intact
+        """
+        reasons = []
+        for step in self.steps():
+            try:
+                stored = self._verify(step)
+            except BrokenStateError as error:
+                reasons.append(str(error))
+                continue
+            for reason in reasons:
+                warnings.warn(f"{reason}; going back to the state of step {step:,}", RuntimeWarning, stacklevel=2)
+            return stored
+        if reasons:
+            raise BrokenStateError(f"No state in {self.folder} is intact: {'; '.join(reasons)}")
+        return None
+
+    def at(self, step: int) -> Stored:
+        """
+        Verify and return the state of a step.
+
+        :return: the state of a step
+        :raises ValueError: if there is none, or it is broken
+        """
+        if step not in self.steps():
+            there = ", ".join(f"{known:,}" for known in self.steps()) or "none"
+            raise ValueError(f"{self.folder} has no state of step {step:,}; there are: {there}")
+        return self._verify(step)
+
+    def _read_manifest(self, step: int) -> dict[str, Any]:
+        path = self._path(step) / _MANIFEST
+        try:
+            text, digest = path.read_text().splitlines()
+        except (OSError, ValueError) as error:
+            raise BrokenStateError(f"{path} is missing or damaged") from error
+        if hashlib.sha256(text.encode()).hexdigest() != digest:
+            raise BrokenStateError(f"{path} is damaged")
+        manifest = json.loads(text)
+        if manifest["format"] != _FORMAT:
+            raise BrokenStateError(f"{path} is of format {manifest['format']}, this version reads {_FORMAT}")
+        return manifest
+
+    def _verify(self, step: int) -> Stored:
+        path, manifest = self._path(step), self._read_manifest(step)
+        stored = Stored(step, path, manifest["shared"])
+        files = {path / name: digest for name, digest in manifest["files"].items()}
+        for file, digest in [*files.items(), *((stored.shared_file(n), d) for n, d in stored.shared.items())]:
+            try:
+                intact = _sha256(file) == digest
+            except OSError as error:
+                raise BrokenStateError(f"{file} cannot be read ({error.strerror})") from error
+            if not intact:
+                raise BrokenStateError(f"{file} is damaged")
+        return stored
+
+    def write_shared(self, name: str, write: Writer) -> str:
+        """
+        Write a file that several states need.
+
+        :return: the SHA-256 of the file
+        :raises OSError: if it cannot be written; nothing of it stays
+        """
+        path = self.folder / _SHARED / name
+        part = path.with_name(f".{name}")
+        try:
+            digest = _write(part, write)
+            os.replace(part, path)
+            _sync_folder(path.parent)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+        return digest
+
+    def write(self, step: int, files: dict[str, Writer], shared: dict[str, str]) -> Stored:
+        """
+        Write a state, whole or not at all.
+
+        :param files: what writes each file, by name
+        :param shared: SHA-256 of the shared files that it needs, by name
+        :raises OSError: if it cannot be written; nothing of it stays, and what was there stays
+        """
+        path = self._path(step)
+        part = path.with_name(f".{path.name}")
+        shutil.rmtree(part, ignore_errors=True)
+        try:
+            part.mkdir()
+            digests = {name: _write(part / name, write) for name, write in files.items()}
+            text = json.dumps({"format": _FORMAT, "step": step, "files": digests, "shared": shared})
+            manifest = f"{text}\n{hashlib.sha256(text.encode()).hexdigest()}\n"
+            _write(part / _MANIFEST, lambda file: file.write_text(manifest))
+            _sync_folder(part)
+            os.replace(part, path)
+            _sync_folder(self.folder)
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)
+            raise
+        return Stored(step, path, shared)
+
+    def remove_after(self, step: int) -> None:
+        """Remove the states beyond the one that was restored."""
+        for later in self.steps():
+            if later > step:
+                self._remove(later)
+
+    def remove_old(self) -> None:
+        """Keep the newest, an older one with the one that will take its place, and the shared files they need."""
+        kept = _kept(self.steps(), self.keep, self.span)
+        for step in self.steps():
+            if step not in kept:
+                self._remove(step)
+        for path in self.folder.glob(".step_*"):
+            shutil.rmtree(path, ignore_errors=True)
+        needed = set()
+        for step in kept:
+            with suppress(BrokenStateError):
+                needed |= set(self._read_manifest(step)["shared"])
+        for path in (self.folder / _SHARED).iterdir():
+            if path.name not in needed:
+                path.unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Remove all states."""
+        for step in self.steps()[::-1]:
+            self._remove(step)
+
+    def remove_all(self) -> None:
+        """Remove the folder, and let go of it."""
+        self.clear()
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self._lock_file.unlink(missing_ok=True)
+        self.close()
+
+    def _remove(self, step: int) -> None:
+        path = self._path(step)
+        part = path.with_name(f".{path.name}")
+        shutil.rmtree(part, ignore_errors=True)
+        os.replace(path, part)  # at once: what is half removed must not be taken for a broken one
+        shutil.rmtree(part, ignore_errors=True)
+
+    def _path(self, step: int) -> Path:
+        return self.folder / f"step_{step:012d}"
+
+
+def _kept(steps: list[int], keep: int, span: int) -> list[int]:
+    """
+    Choose the states that stay.
+
+    :param steps: newest first
+    """
+    older = steps[: keep - 1 : -1]  # oldest first
+    while len(older) > 1 and steps[0] - older[1] >= span:
+        del older[0]
+    return [*steps[:keep], *(older[:2] if span else [])]
+
+
+def _write(path: Path, write: Writer) -> str:
+    write(path)
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    return _sha256(path)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _sync_folder(path: Path) -> None:
+    if os.name == "nt":  # a folder cannot be opened there
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(path: Path) -> Any:
+    file = path.open("w")
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise LockedError(f"Another process writes resume states to {path.parent}") from None
+    if not _is_file_at(file, path):  # removed by a process that has just finished
+        file.close()
+        return _lock(path)
+    return file
+
+
+def _is_file_at(file: Any, path: Path) -> bool:
+    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())

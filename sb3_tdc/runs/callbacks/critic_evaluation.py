@@ -1,0 +1,78 @@
+"""During training, what :mod:`sb3_tdc.critics` shows of a trained model: from the episodes of evaluations."""
+
+import time
+from typing import Any
+
+from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
+
+from sb3_tdc.critics.episodes import Episode, Recording, summarise
+from sb3_tdc.critics.figures import make_figure, render
+from sb3_tdc.runs.callbacks.stopping import StoppableEvaluation
+from sb3_tdc.tdc import TDC
+
+# Steps of evaluations that the critics are asked about: neighbours tell the same
+_EVERY = 10
+# A figure is drawn while all of this stays below this share of the time since training began
+_SHARE = 0.01
+_SECONDS_OF_FIRST_FIGURE = 2.0
+
+
+class CriticEvaluation(StoppableEvaluation):
+    """
+    An evaluation that also holds TDC's critics against the returns of its episodes; of other algorithms, just that.
+
+    Logs ``eval/overestimation``, ``eval/calibration_error``, the seconds all this has taken since training began as
+    ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as fits in one percent of the
+    time. Plays no step more, and draws no random number. Where a time limit ends episodes before the discount has
+    faded, there is nothing to log.
+    """
+
+    def _init_callback(self) -> None:
+        super()._init_callback()
+        self.recordings: dict[int, Recording] = {}
+        self.episodes: list[Episode] = []
+        self.elapsed = 0.0
+        self.seconds_per_figure = _SECONDS_OF_FIRST_FIGURE
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        super()._log_success_callback(locals_, globals_)
+        if isinstance(self.model, TDC):
+            start = time.perf_counter()
+            self._record(self.model, locals_)
+            self.elapsed += time.perf_counter() - start
+            self.logger.record("time/critics_elapsed", self.elapsed, exclude="tensorboard")
+
+    def _record(self, model: TDC, step: dict[str, Any]) -> None:
+        """
+        Record a step of an evaluation.
+
+        :param step: the local variables of ``evaluate_policy``
+        """
+        i, observations = step["i"], step["observations"]
+        if i not in self.recordings:
+            self.recordings[i] = Recording(model, _EVERY, model.get_vec_normalize_env())
+        observation = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
+        self.recordings[i].add(observation, step["actions"][i], float(step["reward"]))
+        if not step["done"]:
+            return
+        self.episodes.append(self.recordings.pop(i).finish(not step["info"].get("TimeLimit.truncated", False)))
+        if len(self.episodes) == self.n_eval_episodes:
+            episodes, self.episodes = self.episodes, []
+            summary = summarise(episodes)
+            for name, value in summary.items():
+                self.logger.record(f"eval/{name}", value)
+            if summary:
+                self._draw(episodes)
+
+    def _draw(self, episodes: list[Episode]) -> None:
+        start = time.perf_counter()
+        seconds = (time.time_ns() - self.model.start_time) / 1e9
+        has_tensorboard = any(isinstance(writer, TensorBoardOutputFormat) for writer in self.logger.output_formats)
+        if not has_tensorboard or self.elapsed + self.seconds_per_figure > _SHARE * seconds:
+            return
+        try:
+            picture = render(make_figure(episodes, f"Evaluation at step {self.num_timesteps:,}"))
+        except ImportError:  # the numbers are enough
+            return
+        self.logger.record("eval/critics", Image(picture, "HWC"), exclude=("stdout", "log", "json", "csv"))
+        self.seconds_per_figure = time.perf_counter() - start

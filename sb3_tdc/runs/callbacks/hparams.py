@@ -1,0 +1,27 @@
+"""TensorBoard's HParams tab."""
+
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import HParam
+
+
+class RecordHyperparams(BaseCallback):
+    """
+    Write hyperparameters to TensorBoard's HParams tab when training begins.
+
+    :param hyperparams: by name; what is not a number or a text is written as one
+    """
+
+    def __init__(self, hyperparams: dict[str, Any]):
+        super().__init__()
+        plain = (bool, int, float, str)
+        self.hparams = {k: v if isinstance(v, plain) else str(v) for k, v in hyperparams.items()}
+
+    def _on_training_start(self) -> None:
+        metrics: dict[str, float] = {"eval/mean_reward": 0.0, "rollout/ep_rew_mean": 0.0}
+        self.logger.record("hparams", HParam(self.hparams, metrics), exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)
+
+    def _on_step(self) -> bool:
+        return True

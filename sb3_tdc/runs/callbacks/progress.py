@@ -1,0 +1,114 @@
+"""How far a run is: a bar on a terminal, rare plain lines elsewhere."""
+
+import time
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+
+# Without evaluations, a line so often
+_SECONDS_BETWEEN_LINES = 300.0
+_SECONDS_BETWEEN_BAR_UPDATES = 0.1
+
+
+class ProgressCallback(BaseCallback):
+    """
+    Steps, steps per second, time left and the last evaluation.
+
+    :param bar: a bar (needs tqdm) instead of lines
+    :param verbose: 0 for no output
+    :raises ImportError: if there is to be a bar and tqdm is missing, with the command that installs it
+    """
+
+    is_captured = False
+
+    def __init__(self, bar: bool, verbose: int = 1):
+        super().__init__(verbose)
+        self.bar: Any = None
+        self.tqdm: Any = _import_tqdm() if bar and verbose > 0 else None
+        self.evaluation = _Evaluation(self)  # the EvalCallback's callback_after_eval
+        self.last_shown = 0.0
+
+    def _on_training_start(self) -> None:
+        self.start = self.last_shown = time.monotonic()
+        self.first_timestep = self.num_timesteps
+        self.total_timesteps = self.locals["total_timesteps"]
+        if self.tqdm is not None:
+            self.bar = self.tqdm(
+                total=self.total_timesteps,
+                initial=self.num_timesteps,
+                unit=" steps",
+                unit_scale=True,
+                dynamic_ncols=True,
+            )
+
+    def _on_step(self) -> bool:
+        now = time.monotonic()
+        if self.bar is not None:
+            if now - self.last_shown > _SECONDS_BETWEEN_BAR_UPDATES:
+                self.bar.update(self.num_timesteps - self.bar.n)
+                self.last_shown = now
+        elif now - self.last_shown > _SECONDS_BETWEEN_LINES:
+            self.show_line()
+        return True
+
+    def _on_training_end(self) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bar as it is; also called when training is interrupted."""
+        if self.bar is not None:
+            self.bar.update(self.num_timesteps - self.bar.n)
+            self.bar.close()
+            self.bar = None
+
+    def say(self, text: str) -> None:
+        """Print a message, above the bar if there is one."""
+        if self.bar is not None:
+            self.bar.write(text)
+        elif self.verbose > 0:
+            print(text, flush=True)
+
+    def show_evaluation(self, evaluation: EvalCallback) -> None:
+        """Show the evaluation that has just ended."""
+        returns = evaluation.evaluations_results[-1]
+        text = f"{np.mean(returns):.1f} ± {np.std(returns):.1f}"
+        if self.bar is not None:
+            self.bar.set_postfix_str(f"eval {text}, best {evaluation.best_mean_reward:.1f}")
+        elif self.verbose > 0:
+            self.show_line(f"eval {text} ({len(returns)} episodes), best {evaluation.best_mean_reward:.1f}")
+
+    def show_line(self, text: str = "") -> None:
+        """Print one line, for a log file."""
+        if self.verbose == 0:
+            return
+        self.last_shown = time.monotonic()
+        # The callback of an evaluation has counted this step already, this one has not
+        steps = self.model.num_timesteps
+        rate = (steps - self.first_timestep) / max(self.last_shown - self.start, 1e-9)
+        left = timedelta(seconds=round((self.total_timesteps - steps) / rate)) if rate > 0 else "?"
+        share = 100 * steps / self.total_timesteps
+        line = f"{steps:>9,} steps {share:5.1f}% | {rate:.0f} steps/s | {left} left"
+        print(f"{line} | {text}" if text else line, flush=True)
+
+
+class _Evaluation(BaseCallback):
+    """Tell the progress of every evaluation of the ``EvalCallback`` that holds this."""
+
+    def __init__(self, progress: ProgressCallback):
+        super().__init__()
+        self.progress = progress
+
+    def _on_step(self) -> bool:
+        assert isinstance(self.parent, EvalCallback)
+        self.progress.show_evaluation(self.parent)
+        return True
+
+
+def _import_tqdm() -> Any:
+    try:
+        from tqdm import tqdm
+    except ImportError as error:
+        raise ImportError('A progress bar needs tqdm: pip install "sb3-tdc[progress]"') from error
+    return tqdm

@@ -1,0 +1,38 @@
+"""Models saved during training. A full disk does not end training."""
+
+import warnings
+from pathlib import Path
+
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+
+from sb3_tdc.runs.callbacks.finite_guard import check_weights
+from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.models import DISK_ERRORS, save_model
+
+
+class SaveBest(BaseCallback):
+    """Save a new best model, and the statistics of ``VecNormalize``."""
+
+    def __init__(self, folder: RunFolder):
+        super().__init__()
+        self.folder = folder
+
+    def _on_step(self) -> bool:
+        try:
+            save_model(self.model, self.folder, self.folder.best_model)
+        except DISK_ERRORS as error:
+            warnings.warn(f"The best model of step {self.num_timesteps:,} was not saved: {error}", stacklevel=2)
+        return True
+
+
+class SavePeriodically(CheckpointCallback):
+    """SB3's callback, with finite weights only."""
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.save_freq == 0:
+            check_weights(self.model, Path(self._checkpoint_path(extension="zip")))
+        try:
+            return super()._on_step()
+        except DISK_ERRORS as error:
+            warnings.warn(f"The model of step {self.num_timesteps:,} was not saved: {error}", stacklevel=2)
+        return True

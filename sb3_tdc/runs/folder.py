@@ -1,0 +1,254 @@
+"""Where a run keeps its files: RL Zoo's layout, ``logs/tdc/Walker2d-v4_1/…``."""
+
+import json
+import re
+import shlex
+import sys
+import uuid
+import zipfile
+import zlib
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.checks import suggest
+from sb3_tdc.common.commands import command
+from sb3_tdc.common.files import make_numbered, numbered, write_atomically
+from sb3_tdc.common.versions import commit_of_the_code, library_versions, processor_name
+from sb3_tdc.safe_load.regular_files import read_text
+
+_MAX_YAML = 2**18  # bytes; what train.py and RL Zoo write has some thousands
+_CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """
+    The files of one run.
+
+    :param path: ``<log folder>/<algo>/<environment>_<number>``
+    :param env_name: the environment's id, without slashes
+    """
+
+    path: Path
+    env_name: str
+
+    @classmethod
+    def create(cls, log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> "RunFolder":
+        """
+        Make the next free folder; two runs that start at once get one each.
+
+        :param unique: append a UUID to the name
+        """
+        env_name, parent = folder_name(env_id), Path(log_folder) / algo
+        path = make_numbered(parent, env_name, f"_{uuid.uuid4()}" if unique else "")
+        (path / env_name).mkdir()
+        return cls(path, env_name)
+
+    @classmethod
+    def find(cls, log_folder: str | Path, algo: str, env_id: str, number: int = 0) -> "RunFolder":
+        """
+        Find a run in a log folder.
+
+        :param number: of the run; 0 is the latest
+        :raises ValueError: if there is none
+        """
+        env_name, parent = folder_name(env_id), Path(log_folder) / algo
+        runs = numbered(parent, env_name)
+        if not runs or (number and number not in runs):
+            known = f"; there are {', '.join(map(str, sorted(runs)))}" if runs else suggest(env_id, _env_names(parent))
+            wanted = f"run {number} of" if number else "run of"
+            raise ValueError(f"There is no {wanted} {algo} on {env_id} in {parent}{known}")
+        return cls(runs[number or max(runs)], env_name)
+
+    @classmethod
+    def open(cls, path: str | Path) -> "RunFolder":
+        """
+        Open the folder of a run.
+
+        :raises ValueError: if the folder is not one of a run
+        """
+        path = Path(path)
+        configs = list(path.glob("*/config.yml"))
+        if len(configs) != 1:
+            raise ValueError(f"{path} is not the folder of a run: it has no <environment>/config.yml")
+        return cls(path, configs[0].parent.name)
+
+    @property
+    def model(self) -> Path:
+        return self.path / f"{self.env_name}.zip"
+
+    @property
+    def best_model(self) -> Path:
+        return self.path / "best_model.zip"
+
+    @property
+    def trained_agent(self) -> Path:
+        """A copy of the model that the run started from: its networks, if the original has moved when it is resumed."""
+        return self.path / self.env_name / "trained_agent.zip"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The hyperparameters as they were read."""
+        return _read_yaml(self.path / self.env_name / "config.yml")
+
+    @property
+    def args(self) -> dict[str, Any]:
+        """The command line arguments."""
+        return _read_yaml(self.path / self.env_name / "args.yml")
+
+    @property
+    def resume_folder(self) -> Path:
+        """Where the states are that the run can be resumed from."""
+        return self.path / "resume"
+
+    @property
+    def error(self) -> Path:
+        """The traceback of what ended training."""
+        return self.path / self.env_name / "error.txt"
+
+    def write_error(self, text: str) -> None:
+        """Keep a traceback, if there is room for it."""
+        with suppress(OSError):
+            _write_text(self.error, text)
+
+    @property
+    def command_to_resume(self) -> str:
+        return command("train", "--resume", self.path)
+
+    @property
+    def has_results(self) -> bool:
+        """Return whether something would be overwritten if the run began at step 0 again."""
+        logs = {self.path / "progress.csv": 1, **dict.fromkeys(self.path.glob("*monitor.csv"), 2)}  # lines of a header
+        has_rows = any(log.is_file() and log.read_bytes().count(b"\n") > header for log, header in logs.items())
+        return has_rows or any(self.path.glob("*.zip")) or (self.path / "evaluations.npz").is_file()
+
+    @property
+    def n_timesteps(self) -> int:
+        """Environment steps that the run was to take; RL Zoo leaves those of ``-n`` out of its hyperparameters."""
+        given = self.args.get("n_timesteps", -1)
+        return int(given if isinstance(given, int) and given > 0 else self.config["n_timesteps"])
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """The versions, the commit and the processor that the run began with; empty for a run of RL Zoo."""
+        path = self.path / self.env_name / "versions.yml"
+        return _read_yaml(path) if path.is_file() else {}
+
+    @property
+    def steps_at_end(self) -> int | None:
+        """The environment steps that a finished run has taken; None if it is not finished, or does not say so."""
+        return int(_read_yaml(self._finished)["n_timesteps"]) if self._finished.is_file() else None
+
+    @property
+    def is_finished(self) -> bool:
+        """
+        Whether training came to its end, which a callback may have set; after an interruption it has not.
+
+        :raises ValueError: if its model cannot be read
+        """
+        if self._finished.is_file():
+            return True
+        # RL Zoo does not say: its run is finished if the model has all steps
+        is_of_rl_zoo = "resume_freq" not in self.args
+        return is_of_rl_zoo and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
+
+    def steps_of_model(self) -> int:
+        """
+        Return the environment steps that the last model was trained for.
+
+        :raises ValueError: if it cannot be read
+        """
+        try:
+            with zipfile.ZipFile(self.model) as archive:
+                return int(json.loads(archive.read("data"))["num_timesteps"])
+        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"{self.model} cannot be read ({type(error).__name__}: {error})") from error
+
+    @property
+    def _finished(self) -> Path:
+        return self.path / self.env_name / "finished.yml"
+
+    def mark_finished(self, n_timesteps: int) -> None:
+        """The last step has been done, and the model saved."""
+        _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
+
+    def checkpoints(self) -> dict[int, Path]:
+        """Return the models of ``--save-freq``, by timestep, oldest first."""
+        found = {}
+        for path in self.path.glob("rl_model_*_steps.zip"):
+            if match := _CHECKPOINT.fullmatch(path.name):
+                found[int(match[1])] = path
+        return dict(sorted(found.items()))
+
+    def normalization(self, model: Path) -> Path:
+        """Return where the ``VecNormalize`` statistics of one of the run's models are."""
+        if model.name == self.best_model.name:
+            return self.path / "best_model_vecnormalize.pkl"
+        if match := _CHECKPOINT.fullmatch(model.name):
+            return self.path / f"rl_model_vecnormalize_{match[1]}_steps.pkl"
+        return self.path / self.env_name / "vecnormalize.pkl"
+
+    def replay_buffer(self, model: Path) -> Path:
+        """Return where the replay buffer of one of the run's models is."""
+        if match := _CHECKPOINT.fullmatch(model.name):
+            return self.path / f"rl_model_replay_buffer_{match[1]}_steps.pkl"
+        if model.name == self.best_model.name:
+            return self.path / "best_model_replay_buffer.pkl"  # none is saved
+        return self.path / "replay_buffer.pkl"
+
+    @property
+    def changes(self) -> list[dict[str, Any]]:
+        """What ``-params`` changed when the run was resumed: the step, and the hyperparameters from there on."""
+        path = self._changes
+        return _read_yaml(path)["changes"] if path.is_file() else []
+
+    @property
+    def _changes(self) -> Path:
+        return self.path / self.env_name / "changes.yml"
+
+    def record_change(self, step: int, config: dict[str, Any], names: tuple[str, ...]) -> None:
+        """
+        Keep that hyperparameters are others from a step on.
+
+        :param config: all of them, as they are now
+        """
+        change = {"step": step, "hyperparams": {name: config[name] for name in names}}
+        _write_text(self._changes, plain_yaml.dump({"changes": [*self.changes, change]}))
+        _write_text(self.path / self.env_name / "config.yml", plain_yaml.dump(config))
+
+    def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
+        """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""
+        folder = self.path / self.env_name
+        _write_text(folder / "command.txt", shlex.join(sys.orig_argv) + "\n")
+        _write_text(folder / "config.yml", plain_yaml.dump(config))
+        _write_text(folder / "args.yml", plain_yaml.dump(args))
+        about = {**library_versions(), "sb3_tdc": commit_of_the_code() or "a wheel", "processor": processor_name()}
+        _write_text(folder / "versions.yml", plain_yaml.dump(about))
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """
+    Read a YAML file of the folder.
+
+    :raises ValueError: if a file is not a mapping of plain values
+    """
+    content = plain_yaml.load(read_text(path, _MAX_YAML), str(path), is_trusted=False)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} must be a mapping")
+    return content
+
+
+def _write_text(path: Path, text: str) -> None:
+    write_atomically(lambda part: part.write_text(text), path)
+
+
+def folder_name(env_id: str) -> str:
+    """Return an environment's id, as folders and files of its runs are named."""
+    return env_id.replace("/", "-").replace(":", "-")
+
+
+def _env_names(parent: Path) -> set[str]:
+    return {config.parent.name for config in parent.glob("*/*/config.yml")}

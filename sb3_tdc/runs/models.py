@@ -1,0 +1,113 @@
+"""A run's model: built, loaded with what was saved next to it, or saved with the statistics of its environments."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.files import write_atomically
+from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.runs.callbacks.finite_guard import check_weights
+from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.safe_load import load_replay_buffer, load_safely, read_data
+
+# A full disk; PyTorch reports it in its own way
+DISK_ERRORS = (OSError, RuntimeError)
+
+
+def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) -> OffPolicyAlgorithm:
+    """
+    Build a model as its hyperparameters say.
+
+    :param algo: a key of ``ALGORITHMS``
+    :param kwargs: further arguments of the algorithm's constructor
+    """
+    return ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
+
+
+def continue_model(
+    path: Path, algo: str, hyperparams: Hyperparams, env: VecEnv, trust: bool, **kwargs: Any
+) -> OffPolicyAlgorithm:
+    """
+    Load a model to train it further: its policy stays as it was saved, all else is as its hyperparameters say.
+
+    :param path: a zip
+    :raises ValueError: as :func:`load_model`
+    """
+    of_the_saved_model = ("policy", "policy_kwargs")
+    arguments = {name: value for name, value in hyperparams.model.items() if name not in of_the_saved_model}
+    return load_model(path, algo, env, trust, **arguments, **_action_noise(hyperparams, env), **kwargs)
+
+
+def load_experience(model: OffPolicyAlgorithm, path: Path, trust: bool) -> None:
+    """
+    Give a model a saved replay buffer, and let it learn at once.
+
+    :raises ValueError: if the buffer does not fit the model's environments
+    """
+    if trust:
+        model.load_replay_buffer(path)
+    else:
+        load_replay_buffer(path, model)
+    assert model.replay_buffer is not None
+    assert model.env is not None
+    if model.replay_buffer.n_envs != model.env.num_envs:
+        raise ValueError(f"{path} is of {model.replay_buffer.n_envs} environments, this run has {model.env.num_envs}")
+    model.learning_starts = 0  # no random steps on top of the loaded experience
+
+
+def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs: Any) -> OffPolicyAlgorithm:
+    """
+    Load a saved model.
+
+    :param algo: a key of ``ALGORITHMS``
+    :param trust: whether the file may run code, as SB3's ``load`` lets it
+    :param kwargs: those of the algorithm's ``load``
+    :raises ValueError: if a file is not a saved model, is of another algorithm, or is refused
+    """
+    check_saved_by(path, algo)
+    if trust:
+        return ALGORITHMS[algo].load(path, env=env, **kwargs)
+    return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
+
+
+def check_saved_by(path: Path, algo: str) -> None:
+    """
+    Check that a zip was saved by an algorithm.
+
+    :raises ValueError: if a file is not a saved model, or is one of another algorithm
+    """
+    policy_class = read_data(path).get("policy_class")
+    module = policy_class.get("__module__") if isinstance(policy_class, dict) else None
+    modules = {a: {p.__module__ for p in ALGORITHMS[a].policy_aliases.values()} for a in ALGORITHMS}
+    others = [a for a in ALGORITHMS if module in modules[a]]
+    if others and algo not in others:
+        raise ValueError(f"{path} was saved by {' or '.join(others)}, not by {algo}: --algo {others[0]}")
+
+
+def save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
+    """
+    Save a model of a run, and the statistics of ``VecNormalize``.
+
+    :raises NonFiniteError: if a weight is NaN or infinite
+    """
+    check_weights(model, path)
+    write_atomically(model.save, path)
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        write_atomically(lambda part: normalization.save(str(part)), folder.normalization(path))
+
+
+def _action_noise(hyperparams: Hyperparams, env: VecEnv) -> dict[str, Any]:
+    """Return the keyword argument for RL Zoo's ``noise_type``, if there is one."""
+    if hyperparams.noise_type is None:
+        return {}
+    noise = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}[hyperparams.noise_type]
+    shape = env.action_space.shape
+    assert shape is not None
+    return {"action_noise": noise(np.zeros(shape), np.full(shape, hyperparams.noise_std))}

@@ -1,0 +1,144 @@
+"""From settings to a run that can be trained: everything is checked before anything is made."""
+
+import shutil
+import textwrap
+from dataclasses import fields
+from os.path import abspath
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.utils import set_random_seed
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.threads import set_threads
+from sb3_tdc.envs.make import check_env_id, import_packages, split_env_id
+from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
+from sb3_tdc.resume import stored_steps
+from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, flags_of, plain_arguments
+from sb3_tdc.runs.training import TrainingRun
+
+
+def make_run(settings: RunSettings) -> TrainingRun:
+    """
+    Check everything that can be checked, then make the run folder.
+
+    :raises ValueError: for anything that is not allowed
+    """
+    if settings.from_step is not None or settings.start_over:
+        raise ValueError(f"{'--start-over' if settings.start_over else '--from'} goes with --resume RUN_FOLDER")
+    settings.env, settings.gym_packages = split_env_id(settings.env, settings.gym_packages)
+    _prepare(settings)
+    check_settings(settings)
+    if settings.seed < 0:
+        settings.seed = int(np.random.randint(MAX_SEED))
+    hyperparams = read_hyperparams(settings)
+    vars(settings).update(_absolute(vars(settings)))
+    set_random_seed(settings.seed)
+    return TrainingRun(settings, hyperparams, _make_folder(settings, hyperparams))
+
+
+def read_hyperparams(settings: RunSettings) -> Hyperparams:
+    """
+    Read and validate the entry of the environment, overruled by ``-params`` and ``-n``; print it.
+
+    :raises ValueError: naming the source of what is not allowed
+    """
+    path = settings.conf_file or hyperparams_file(settings.algo)
+    entry, name = read_entry(path, settings.env)
+    n_timesteps = {"n_timesteps": settings.n_timesteps} if settings.n_timesteps > 0 else {}
+    overrides = {**settings.hyperparams, **n_timesteps}
+    algorithm = ALGORITHMS[settings.algo]
+    where = f"{path}, {name}"
+    parse({"n_timesteps": 1, **entry}, algorithm, where)  # so that an error names its source
+    parse({"n_timesteps": 1, **overrides}, algorithm, "command line (-params)")
+    hyperparams = parse({**entry, **overrides}, algorithm, where)
+    if settings.verbose > 0:
+        nearest = "" if name == "default" else "; this is the nearest version"
+        other = "" if name == settings.env else f" (it has no entry for {settings.env}{nearest})"
+        print(f"Hyperparameters: {where}{other}")
+        print(textwrap.indent(plain_yaml.dump(hyperparams.raw, sort_keys=False), "  "), end="")
+    return hyperparams
+
+
+def _prepare(settings: RunSettings) -> None:
+    """Set up this process: packages that register environments, and threads."""
+    import_packages(settings.gym_packages)
+    check_env_id(settings.env)
+    set_threads(settings.num_threads)
+
+
+def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
+    """
+    Make the run folder, with everything that the run is resumed from.
+
+    :raises ValueError: if it cannot be written; nothing of it stays
+    """
+    folder = None
+    try:
+        folder = RunFolder.create(settings.log_folder, settings.algo, settings.env, settings.uuid)
+        folder.write_config(hyperparams.raw, settings.as_plain())
+        if settings.trained_agent is not None:
+            shutil.copyfile(settings.trained_agent, folder.trained_agent)
+    except OSError as error:
+        if folder is not None:
+            shutil.rmtree(folder.path, ignore_errors=True)
+        raise ValueError(f"No run folder can be made in {settings.log_folder}: {error}") from error
+    return folder
+
+
+def _absolute(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return the locations among arguments as they are found from any working directory."""
+    locations = {name: arguments[name] for name in ("trained_agent", "tensorboard_log") if arguments.get(name)}
+    return {name: type(location)(abspath(location)) for name, location in locations.items()}
+
+
+def resume_run(given: dict[str, Any]) -> TrainingRun | None:
+    """
+    Open a run to resume it.
+
+    :param given: the settings on the command line
+    :return: None if the run is finished
+    :raises ValueError: if there is nothing to resume, or a setting contradicts the run's
+    """
+    folder = RunFolder.open(given["resume"])
+    if not (folder.path / folder.env_name / "args.yml").is_file():
+        raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
+    settings = _resumed_settings(folder, {**given, **_absolute(given)})
+    if folder.is_finished:
+        return None
+    if settings.resume_freq <= 0:
+        raise ValueError(f"{folder.path} has no resume states: it was made without --resume-freq")
+    has_state = bool(stored_steps(folder.resume_folder)) and not settings.start_over
+    if folder.has_results and not has_state and not settings.start_over:
+        raise ValueError(
+            f"{folder.path} has results, but {folder.resume_folder} has no resume states: "
+            "--start-over begins at step 0 again, and overwrites the results"
+        )
+    _prepare(settings)
+    where, config = str(folder.path / folder.env_name / "config.yml"), folder.config
+    changed = given.get("hyperparams", {})
+    differing = {name: value for name, value in changed.items() if name not in config or config[name] != value}
+    parse({"n_timesteps": 1, **differing}, ALGORITHMS[settings.algo], "command line (-params)")
+    hyperparams = parse({**config, **differing}, ALGORITHMS[settings.algo], where)
+    set_random_seed(settings.seed)
+    return TrainingRun(settings, hyperparams, folder, tuple(differing))
+
+
+def _resumed_settings(folder: RunFolder, given: dict[str, Any]) -> RunSettings:
+    """
+    Return the settings of a run, with what may differ now.
+
+    :raises ValueError: if something given contradicts them
+    """
+    stored, now = folder.args, {}
+    for declared in fields(RunSettings):
+        name, flag = declared.name, flags_of(declared)[-1]
+        if name in given and declared.metadata["role"] in (Role.PROCESS, Role.RESUMING):
+            now[name] = given[name]
+        elif name in given and (value := plain_arguments(given)[name]) != stored.get(name, value):
+            raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {stored[name]}")
+    known = {declared.name for declared in fields(RunSettings)}
+    fresh = {"resume": None, "from_step": None, "start_over": False}
+    return RunSettings(**{**{k: v for k, v in stored.items() if k in known}, **fresh, **now})

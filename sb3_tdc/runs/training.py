@@ -1,0 +1,350 @@
+"""One run, from its settings to its saved model. Called by the command line, by the matrix and by tests."""
+
+import shutil
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import (
+    CSVOutputFormat,
+    HumanOutputFormat,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+)
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tdc.advb import BoardCallback
+from sb3_tdc.advb.algorithms import Advised
+from sb3_tdc.common.diagnostics import NonFiniteError
+from sb3_tdc.common.files import make_numbered, write_atomically
+from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
+from sb3_tdc.envs.checked import EnvironmentFaultError, describe_exception
+from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
+from sb3_tdc.envs.processes import closing_envs, ended_processes
+from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.resume import LockedError, NotRestoredError, ResumeStates, stored_steps
+from sb3_tdc.runs.callbacks.busy_machine import BusyMachine
+from sb3_tdc.runs.callbacks.critic_evaluation import CriticEvaluation
+from sb3_tdc.runs.callbacks.finite_guard import FiniteGuard, divergence_named
+from sb3_tdc.runs.callbacks.hparams import RecordHyperparams
+from sb3_tdc.runs.callbacks.progress import ProgressCallback
+from sb3_tdc.runs.callbacks.saving import SaveBest, SavePeriodically
+from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.models import DISK_ERRORS, check_saved_by, continue_model, load_experience, make_model, save_model
+from sb3_tdc.runs.settings import RunSettings
+
+# Seeds of evaluations and of a board's test episodes, above the run's: other initial states than in training
+_EVALUATION_SEED, _BOARD_SEED = 1_000, 2_000
+
+
+@dataclass
+class TrainingRun:
+    """
+    What one run is made of.
+
+    :param folder: which holds the settings and hyperparameters already
+    :param changed: hyperparameters that are others from here on, when the run is resumed
+    """
+
+    settings: RunSettings
+    hyperparams: Hyperparams
+    folder: RunFolder
+    changed: tuple[str, ...] = ()
+
+    @property
+    def is_resumed(self) -> bool:
+        return self.settings.resume is not None
+
+    @cached_property
+    def has_state(self) -> bool:
+        """Return whether it begins from a resume state, which has more than is saved with a model."""
+        return self.is_resumed and not self.settings.start_over and bool(stored_steps(self.folder.resume_folder))
+
+    @property
+    def origin(self) -> Path | None:
+        """The zip whose model is trained further."""
+        given = self.settings.trained_agent
+        return None if given is None else self.folder.trained_agent if self.has_state else Path(given)
+
+    @property
+    def log_interval(self) -> int | None:
+        """Episodes between log entries; None for none."""
+        given = self.settings.log_interval
+        return 4 if given == -1 else max(given, 0) or None
+
+
+class NotSavedError(Exception):
+    """A trained model that cannot be written, with the reason in one sentence."""
+
+
+class TrainingError(Exception):
+    """Training that an environment, a wrapper or a callback ended: the step and the reason in one sentence."""
+
+
+class SetupError(ValueError):
+    """A run that could not begin, with the reason in one sentence."""
+
+
+@dataclass(frozen=True)
+class TrainingOutcome:
+    """
+    How a run ended.
+
+    :param interrupted: whether the user stopped it before its last step
+    :param resume_step: the timestep from which it can be resumed, if it can
+    """
+
+    model: OffPolicyAlgorithm
+    interrupted: bool
+    resume_step: int | None
+
+
+def train(run: TrainingRun) -> TrainingOutcome:
+    """
+    Train from the first step to the last, or to Ctrl-C; either way the model is saved (after a second one, it is not).
+
+    :raises SetupError: if the run cannot begin; its folder is removed, if it was made for it
+    :raises NonFiniteError: if training diverged; saved models stay as they are
+    :raises TrainingError: if an environment or a callback raised; the folder has the traceback
+    :raises NotSavedError: if the trained model cannot be written
+    :raises LockedError: if another process has begun to write to the folder
+    """
+    with ended_processes(), ExitStack() as stack:
+        with _setting_up(run, stack):
+            if run.origin is not None:
+                check_saved_by(run.origin, run.settings.algo)
+            states = _open_states(run)
+            if states is not None:
+                stack.callback(states.store.close)
+            model = _make_model(run, stack.enter_context(closing_envs(_make_training_envs(run))))
+            model.set_logger(_make_logger(run))
+            stack.callback(model.logger.close)
+            stop = StopOnSignal(states)
+            callbacks = _make_callbacks(run, model, stop, states, stack)
+            if states is not None:
+                _select_state(run, states, model)
+        with stop, divergence_named(model):
+            _learn(run, model, callbacks)
+            _save(run, model)
+        if not stop.requested:
+            run.folder.mark_finished(model.num_timesteps)
+            if states is not None:
+                states.store.remove_all()
+        return TrainingOutcome(model, stop.requested, states.last_step if states is not None else None)
+
+
+@contextmanager
+def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
+    """Close everything if this block fails, remove the folder of a new run, and give the reason in one sentence."""
+    try:
+        yield
+    except BaseException as error:
+        stack.close()
+        if not run.is_resumed:
+            shutil.rmtree(run.folder.path)
+        if not isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt)):
+            raise
+        raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
+
+
+def _learn(run: TrainingRun, model: OffPolicyAlgorithm, callbacks: list[BaseCallback]) -> None:
+    try:
+        model.learn(
+            run.hyperparams.n_timesteps,
+            callback=callbacks,
+            log_interval=run.log_interval,  # type: ignore[arg-type]  # None is none
+        )
+    except (NonFiniteError, NotRestoredError, LockedError):
+        raise
+    except Exception as error:
+        if isinstance(error, EnvironmentFaultError):
+            reason, details = str(error), error.details
+        else:
+            reason, details = describe_exception(error), ""
+        if model.num_timesteps == 0 and not run.is_resumed:
+            shutil.rmtree(run.folder.path)
+            raise SetupError(f"{run.settings.env} failed before the first step: {reason}") from error
+        run.folder.write_error(details or traceback.format_exc())
+        raise TrainingError(f"Training failed at step {model.num_timesteps:,}: {reason}") from error
+
+
+def _save(run: TrainingRun, model: OffPolicyAlgorithm) -> None:
+    folder = run.folder
+    try:
+        save_model(model, folder, folder.model)
+        if run.settings.save_replay_buffer:
+            write_atomically(model.save_replay_buffer, folder.replay_buffer(folder.model))
+    except DISK_ERRORS as error:
+        reason = " ".join(str(error).split())
+        raise NotSavedError(f"The model of step {model.num_timesteps:,} could not be saved: {reason}") from error
+
+
+# ---------------------------------------------------------------- resume states
+
+
+def _open_states(run: TrainingRun) -> ResumeStates | None:
+    folder, settings = run.folder, run.settings
+    if settings.resume_freq <= 0:
+        return None
+    of_evaluations = [folder.best_model, folder.normalization(folder.best_model)]
+    states = ResumeStates(
+        folder.resume_folder,
+        settings.resume_freq,
+        files=of_evaluations if settings.eval_freq > 0 else [],
+        hyperparams=run.hyperparams.raw,
+        verbose=settings.verbose,
+    )
+    if settings.start_over:
+        states.store.clear()
+    if run.is_resumed and not states.store.steps():  # stopped before its first step
+        for events in folder.path.glob("events.out.tfevents.*"):
+            events.unlink()
+    return states
+
+
+def _select_state(run: TrainingRun, states: ResumeStates, model: OffPolicyAlgorithm) -> None:
+    """Select the state to resume from, and record hyperparameters that are others from there on."""
+    folder = run.folder
+    # Whatever has ever been changed is as in config.yml: the state may be older than the change
+    earlier = [name for change in folder.changes for name in change["hyperparams"]]
+    step = states.select(model, run.settings.from_step, [*earlier, *run.changed])
+    if run.changed:
+        folder.record_change(step or 0, run.hyperparams.raw, run.changed)
+
+
+# ---------------------------------------------------------------- environments
+
+
+def _make_training_envs(run: TrainingRun) -> VecEnv:
+    normalization = None
+    if run.origin is not None and not run.has_state:
+        normalization = RunFolder(run.origin.parent, run.folder.env_name).normalization(run.origin)
+        if not normalization.exists():
+            normalization = None
+        elif run.hyperparams.normalize is None:
+            raise ValueError(f"{run.origin} was trained on normalised observations: add -params normalize:true")
+    settings = run.settings
+    return make_envs(
+        settings.env,
+        run.hyperparams,
+        settings.seed,
+        run.hyperparams.n_envs,
+        settings.env_kwargs,
+        settings.vec_env,
+        monitor_folder=run.folder.path,
+        normalization=normalization,
+        trust=settings.trust,
+    )
+
+
+def _make_other_envs(
+    run: TrainingRun, model: OffPolicyAlgorithm, stack: ExitStack, seed: int, n_envs: int, env_kwargs: dict[str, Any]
+) -> VecEnv:
+    """Make environments that are not trained in, wrapped as the model's."""
+    settings = run.settings
+    envs = make_envs(
+        settings.env, run.hyperparams, settings.seed + seed, n_envs, env_kwargs, settings.vec_env, training=False
+    )
+    return model._wrap_env(stack.enter_context(closing_envs(envs)), verbose=0, monitor_wrapper=False)
+
+
+# ---------------------------------------------------------------- model, logger, callbacks
+
+
+def _make_model(run: TrainingRun, env: VecEnv) -> OffPolicyAlgorithm:
+    settings = run.settings
+    arguments = {"seed": settings.seed, "device": settings.device, "verbose": int(settings.verbose > 1)}
+    if run.origin is None:
+        return make_model(settings.algo, run.hyperparams, env, **arguments)
+    model = continue_model(run.origin, settings.algo, run.hyperparams, env, settings.trust, **arguments)
+    experience = RunFolder(run.origin.parent, run.folder.env_name).replay_buffer(run.origin)
+    if not run.has_state and experience.exists():
+        load_experience(model, experience, settings.trust)
+    return model
+
+
+def _make_logger(run: TrainingRun) -> Logger:
+    folder, settings = run.folder.path, run.settings
+    writers: list[KVWriter] = [CSVOutputFormat(str(folder / "progress.csv"))]
+    if settings.tensorboard_log is None:
+        writers.append(TensorBoardOutputFormat(str(folder)))
+    elif settings.tensorboard_log:
+        parent = Path(settings.tensorboard_log) / run.folder.env_name
+        writers.append(TensorBoardOutputFormat(str(make_numbered(parent, settings.algo.upper()))))
+    if settings.verbose > 1:
+        writers.append(HumanOutputFormat(sys.stdout))
+    return Logger(str(folder), writers)
+
+
+def _make_callbacks(
+    run: TrainingRun, model: OffPolicyAlgorithm, stop: StopOnSignal, states: ResumeStates | None, stack: ExitStack
+) -> list[BaseCallback]:
+    """Make all callbacks, in the order in which they are called: a state is written before anything else happens."""
+    settings, hyperparams = run.settings, run.hyperparams
+    progress = ProgressCallback(bool(settings.progress), settings.verbose)
+    stack.callback(progress.close)
+    callbacks: list[BaseCallback] = [BusyMachine(progress.say, _remedy(run))]
+    if not isinstance(model, CheckedOffPolicyAlgorithm):
+        callbacks.append(FiniteGuard())
+    if states is not None:
+        callbacks.append(states)
+    if isinstance(model, Advised):
+        callbacks.append(BoardCallback(_make_other_envs(run, model, stack, _BOARD_SEED, 1, settings.env_kwargs)))
+    callbacks += [make() for make in hyperparams.callbacks]
+    identity = {"algo": settings.algo, "env": settings.env, "seed": settings.seed}
+    callbacks.append(RecordHyperparams(identity | hyperparams.raw))
+    callbacks += _make_saving(run)
+    callbacks += _make_evaluation(run, model, progress, stop, stack)
+    return [*callbacks, progress, stop]
+
+
+def _make_saving(run: TrainingRun) -> list[BaseCallback]:
+    settings, folder = run.settings, run.folder.path
+    if settings.save_freq <= 0:
+        return []
+    with_buffer = settings.save_replay_buffer
+    freq = _calls(run, settings.save_freq)
+    return [SavePeriodically(freq, str(folder), save_replay_buffer=with_buffer, save_vecnormalize=True)]
+
+
+def _make_evaluation(
+    run: TrainingRun, model: OffPolicyAlgorithm, progress: ProgressCallback, stop: StopOnSignal, stack: ExitStack
+) -> list[BaseCallback]:
+    settings = run.settings
+    if settings.eval_freq <= 0:
+        return []
+    env_kwargs = settings.eval_env_kwargs or settings.env_kwargs
+    return [
+        CriticEvaluation(
+            _make_other_envs(run, model, stack, _EVALUATION_SEED, settings.n_eval_envs, env_kwargs),
+            stop,
+            callback_on_new_best=SaveBest(run.folder),
+            callback_after_eval=progress.evaluation,
+            n_eval_episodes=settings.eval_episodes,
+            eval_freq=_calls(run, settings.eval_freq),
+            log_path=str(run.folder.path),
+            deterministic=True,
+            verbose=0,
+        )
+    ]
+
+
+def _calls(run: TrainingRun, freq: int) -> int:
+    """Return environment steps as calls of a callback, which is called once for a step of all environments."""
+    return max(freq // run.hyperparams.n_envs, 1)
+
+
+def _remedy(run: TrainingRun) -> str:
+    """Return what to do to continue on one thread."""
+    if run.settings.resume_freq > 0:
+        return f"press Ctrl-C, then\n  {run.folder.command_to_resume} --num-threads 1"
+    return "press Ctrl-C, and add --num-threads 1 to the command that is printed then."

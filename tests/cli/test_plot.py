@@ -1,0 +1,51 @@
+"""Learning curves from the evaluations of runs."""
+
+import numpy as np
+import pytest
+
+from sb3_tdc.cli import plot
+from sb3_tdc.runs.folder import RunFolder
+
+figure = pytest.importorskip("matplotlib.figure")
+
+
+def make_run(folder, env_id="A-v0", seed=1, evaluated=True):
+    run = RunFolder.create(folder, "tdc", env_id)
+    run.write_config({}, {"algo": "tdc", "env": env_id, "seed": seed})
+    if evaluated:
+        np.savez(run.path / "evaluations.npz", timesteps=[10, 20], results=[[1.0, 3.0], [5.0, 9.0]])
+    return run.path
+
+
+def test_lines_are_means_and_dots_are_episodes(tmp_path):
+    curve = plot.load_curve(RunFolder.open(make_run(tmp_path, seed=4)))
+    assert curve.label == "tdc, seed 4"
+    axes = figure.Figure().subplots()
+    plot.draw_curves(axes, [curve])
+    (line,) = axes.lines
+    assert line.get_xydata().tolist() == [[10, 2], [20, 7]]
+    (dots,) = axes.collections
+    assert dots.get_offsets().tolist() == [[10, 1], [10, 3], [20, 5], [20, 9]]
+    assert axes.get_ylabel() == "return of 2 mean-action episodes"
+
+
+def test_a_figure_of_several_runs(tmp_path, capsys):
+    runs = [make_run(tmp_path, seed=seed) for seed in (1, 2)]
+    file = tmp_path / "figures" / "curve.png"
+    assert plot.main([*map(str, runs), "-o", str(file)]) == 0
+    assert file.read_bytes().startswith(b"\x89PNG")
+    assert str(file) in capsys.readouterr().out
+
+
+def test_what_cannot_be_drawn_is_said(tmp_path, capsys):
+    a, b = make_run(tmp_path), make_run(tmp_path, "B-v0")
+    none = make_run(tmp_path, evaluated=False)
+    for runs, message in (
+        ([a, b], "The runs must be of one environment"),
+        ([none], "the run has not been evaluated yet"),
+        ([tmp_path], "is not the folder of a run"),
+    ):
+        with pytest.raises(SystemExit):
+            plot.main([*map(str, runs), "-o", str(tmp_path / "x.png")])
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "x.png").exists()

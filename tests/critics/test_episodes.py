@@ -1,0 +1,253 @@
+"""What critics predict against what follows: by hand, then on a task whose returns are known."""
+
+import csv
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_tdc import TDC
+from sb3_tdc.cli import enjoy, train
+from sb3_tdc.critics import episodes as explain
+from sb3_tdc.critics import figures
+from sb3_tdc.runs.callbacks import critic_evaluation
+from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+
+REWARDS = st.lists(st.floats(-100, 100), min_size=1, max_size=30)
+
+
+class Corridor(gym.Env):
+    """The reward is 1 at every step, whatever is done; it ends by itself after ``length`` steps."""
+
+    observation_space = gym.spaces.Box(0, 1, (1,), dtype=np.float32)
+    action_space = gym.spaces.Box(-2, 2, (1,), dtype=np.float32)
+
+    def __init__(self, length):
+        self.length, self.step_count = length, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.step_count = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.step_count += 1
+        observation = np.array([self.step_count / 100 % 1], np.float32)
+        return observation, 1.0, self.step_count >= self.length, False, {}
+
+
+def make_env(length, limit=10_000):
+    return DummyVecEnv([lambda: gym.wrappers.TimeLimit(Corridor(length), limit)])
+
+
+def make_model(env, **kwargs):
+    return TDC("MlpPolicy", env, gamma=0.9, seed=0, policy_kwargs={"net_arch": [8], "n_quantiles": 4}, **kwargs)
+
+
+def test_discounted_returns_by_hand():
+    # G_2 = 4, G_1 = 2 + 0.5·4 = 4, G_0 = 1 + 0.5·4 = 3
+    assert explain.discounted_returns(np.array([1.0, 2.0, 4.0]), 0.5).tolist() == [3, 4, 4]
+
+
+@given(REWARDS, st.floats(0, 1))
+def test_discounted_returns_are_the_sums(rewards, gamma):
+    sums = [sum(gamma**i * r for i, r in enumerate(rewards[step:])) for step in range(len(rewards))]
+    np.testing.assert_allclose(explain.discounted_returns(np.array(rewards), gamma), sums, atol=1e-6)
+
+
+def test_a_truncated_episode_is_known_where_its_tail_weighs_nothing():
+    # 0.5^7 = 0.0078 is the first power of at most 0.01: the last 6 of 10 steps have an unseen tail that weighs more
+    assert explain.steps_until_negligible(0.5) == 7
+    assert explain.known_steps(10, terminated=False, gamma=0.5) == 3
+    assert explain.known_steps(5, terminated=False, gamma=0.5) == 0
+    assert explain.known_steps(10, terminated=True, gamma=0.5) == 10
+    assert explain.known_steps(10, terminated=False, gamma=1.0) == 0
+    assert explain.known_steps(10, terminated=False, gamma=0.0) == 9
+
+
+def test_observed_frequency_by_hand():
+    quantiles = np.array([[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]])
+    # 1 lies at or below the second and third, 3 above all of them
+    assert explain.observed_frequency(quantiles, np.array([1.0, 3.0])).tolist() == [0, 0.5, 0.5]
+
+
+def test_right_quantiles_are_calibrated_and_moved_ones_are_not():
+    rng = np.random.default_rng(0)
+    levels = (np.arange(9) + 0.5) / 9
+    quantiles = np.tile(-np.log(1 - levels), (50_000, 1))  # of the exponential distribution
+    returns = rng.exponential(size=50_000)
+
+    def summary(shift):
+        z = (quantiles + shift)[:, None]
+        return explain.summarise([explain.Episode(np.arange(50_000), z, np.zeros(50_000, int), returns)])
+
+    assert summary(0.0)["calibration_error"] < 0.01
+    assert summary(10.0)["calibration_error"] == pytest.approx(0.5, abs=1e-3)  # all returns are below: mean of 1 − τ
+    assert summary(10.0)["overestimation"] - summary(0.0)["overestimation"] == pytest.approx(10)
+
+
+def test_unknown_returns_do_not_count():
+    quantiles = np.zeros((3, 2, 4)) + np.array([[[1.0]], [[2.0]], [[50.0]]])
+    episode = explain.Episode(np.arange(3), quantiles, np.zeros(3, int), np.array([0.0, 0.0, np.nan]))
+    assert explain.summarise([episode])["overestimation"] == pytest.approx(1.5)
+    unknown = explain.Episode(np.arange(3), quantiles, np.zeros(3, int), np.full(3, np.nan))
+    assert explain.summarise([unknown]) == {}
+    assert explain.summarise([episode, unknown]) == explain.summarise([episode])
+
+
+def test_unknown_returns_can_be_drawn():
+    pytest.importorskip("matplotlib")
+    unknown = explain.Episode(np.arange(3), np.zeros((3, 2, 4)), np.zeros(3, int), np.full(3, np.nan))
+    figure = figures.make_figure([unknown], "title")
+    assert figures.render(figure).ndim == 3
+    (calibration,) = (axes for axes in figure.axes if axes.get_title(loc="left").startswith("Calibration"))
+    assert len(calibration.lines) == 1  # the diagonal alone
+
+
+def test_episodes_too_short_to_know_a_return_leave_no_trace_in_the_log(tmp_path, monkeypatch):
+    """As Pendulum's, which a time limit of 200 steps ends."""
+    monkeypatch.setattr(critic_evaluation, "_SHARE", 1e9)
+    argv = ["--env", "Pendulum-v1", "-n", 60, "-f", tmp_path, "--eval-freq", 50, "--eval-episodes", 1, "--verbose", 0]
+    assert train.main([str(a) for a in [*argv, "-params", "learning_starts:100"]]) == 0
+    header = (tmp_path / "tdc" / "Pendulum-v1_1" / "progress.csv").read_text().splitlines()[0]
+    assert "eval/mean_reward" in header
+    assert "eval/overestimation" not in header
+
+
+def test_play_records_what_the_critics_say_about_the_action_that_is_played():
+    env = make_env(length=30)
+    model = make_model(env, lam=0.5)
+    (episode,) = explain.record_episodes(model, env, 1)
+    np.testing.assert_allclose(episode.returns, (1 - 0.9 ** np.arange(30, 0, -1)) / 0.1)
+    observation = np.array([0.07], np.float32)  # of step 7
+    action, _ = model.predict(observation)
+    scaled = model.policy.scale_action(action[None])
+    with th.no_grad():
+        expected = model.critic(th.as_tensor(observation[None]), th.as_tensor(scaled))[0].numpy()
+    np.testing.assert_allclose(episode.quantiles[7], expected, rtol=1e-5)
+    scores = expected.mean(axis=1) - 0.5 * expected.std(axis=1)
+    assert episode.selected[7] == scores.argmin()
+
+
+def test_play_goes_on_behind_the_time_limit_and_shows_what_lies_before():
+    horizon = explain.steps_until_negligible(0.9)  # 44
+    env = make_env(length=10_000, limit=20 + horizon)
+    episodes = explain.record_episodes(make_model(env), env, 2, limit=20)
+    for episode in episodes:
+        assert len(episode.steps) == len(episode.quantiles) == 20
+        np.testing.assert_allclose(episode.returns, 10, rtol=0.011)  # 1/(1 − γ), but for the last percent
+
+
+def test_rewards_are_those_that_the_critics_know():
+    env = VecNormalize(make_env(length=5), training=False)
+    env.ret_rms.var = np.float64(4.0)  # rewards are divided by 2
+    model = make_model(env)
+    (normalised,) = explain.record_episodes(model, env, 1)
+    assert normalised.returns[-1] == pytest.approx(0.5, rel=1e-4)
+    recording = explain.Recording(model, every=2, normalization=env)
+    for _ in range(5):
+        recording.add(np.zeros(1, np.float32), np.zeros(1, np.float32), 1.0)
+    episode = recording.finish(terminated=True)
+    assert episode.steps.tolist() == [0, 2, 4]
+    np.testing.assert_allclose(episode.returns, normalised.returns[::2], rtol=1e-6)
+
+
+def test_a_figure_of_any_number_of_critics():
+    pytest.importorskip("matplotlib")
+    env = make_env(length=10)
+    model = TDC("MlpPolicy", env, policy_kwargs={"net_arch": [8], "n_quantiles": 4, "n_critics": 3})
+    figure = figures.make_figure(explain.record_episodes(model, env, 2), "title", figures.describe_play(model))
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == [
+        *(f"Critic {i}, first episode" for i in (1, 2, 3)),
+        "Selected critic, first episode",
+        "Calibration, 2 episodes",
+        "Overestimation, 2 episodes",
+    ]
+    height, width, channels = figures.render(figure).shape
+    assert height > 100
+    assert width > 100
+    assert channels == 3
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with normalised rewards, of the stochastic head and two evaluation environments."""
+    folder = tmp_path_factory.mktemp("logs")
+    options = "policy_kwargs:{net_arch: [8], n_quantiles: 4}", "learning_starts:100", "batch_size:16", "normalize:true"
+    argv = ["-n", 400, "--seed", 1, "-f", folder, "--eval-freq", 200, "--eval-episodes", 3, "--n-eval-envs", 2]
+    argv += ["--env", "Hopper-v4", "--verbose", 0, "-params", *options, "stochastic_actor:true"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(critic_evaluation, "_SHARE", 1e9)  # no time to wait for figures
+        assert train.main([str(a) for a in argv]) == 0
+    return folder / "tdc" / "Hopper-v4_1"
+
+
+def test_evaluations_log_the_critics(run):
+    (events,) = run.glob("events.out.tfevents.*")
+    accumulator = EventAccumulator(str(events)).Reload()
+    for name in ("overestimation", "calibration_error"):
+        assert [event.step for event in accumulator.Scalars(f"eval/{name}")] == [200, 400]
+    assert all(0 <= event.value <= 1 for event in accumulator.Scalars("eval/calibration_error"))
+    assert [event.step for event in accumulator.Images("eval/critics")] == [200, 400]
+    with (run / "progress.csv").open() as file:
+        elapsed = [float(row["time/critics_elapsed"]) for row in csv.DictReader(file) if row["time/critics_elapsed"]]
+    assert 0 < elapsed[0] < elapsed[-1] < 30
+
+
+def test_a_figure_waits_until_it_takes_a_hundredth_of_the_time(tmp_path):
+    argv = ["-n", 200, "-f", tmp_path, "--eval-freq", 100, "--eval-episodes", 1, "--env", "Hopper-v4", "--verbose", 0]
+    assert train.main([str(a) for a in argv]) == 0
+    (events,) = (tmp_path / "tdc" / "Hopper-v4_1").glob("events.out.tfevents.*")
+    tags = EventAccumulator(str(events)).Reload().Tags()
+    assert "eval/overestimation" in tags["scalars"]
+    assert tags["images"] == []  # of less than 200 s, not even the first fits
+
+
+def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monkeypatch):
+    """What is logged is what one gets by playing the same episodes again."""
+    seen = []
+    monkeypatch.setattr(critic_evaluation, "summarise", lambda episodes: seen.append(episodes) or {})
+    monkeypatch.setattr(critic_evaluation, "_EVERY", 1)
+    env, eval_env = (VecNormalize(make_env(length=12)) for _ in range(2))
+    eval_env.training = eval_env.norm_reward = False
+    model = make_model(env, gradient_steps=0)
+    model.learn(30, callback=critic_evaluation.CriticEvaluation(
+        eval_env, StopOnSignal(), n_eval_episodes=2, eval_freq=30, verbose=0, warn=False
+    ))  # fmt: skip
+    (episodes,) = seen
+    assert len(episodes) == 2
+    env.training, env.norm_reward = False, True
+    (expected,) = explain.record_episodes(model, env, 1)
+    for episode in episodes:
+        np.testing.assert_allclose(episode.returns, expected.returns, rtol=1e-5)
+        np.testing.assert_allclose(episode.quantiles, expected.quantiles, rtol=1e-4, atol=1e-6)
+
+
+def test_enjoy_explains_a_run(run, capsys):
+    assert enjoy.main(["--explain", str(run), "--n-episodes", "2"]) == 0
+    screen = capsys.readouterr().out
+    assert "Overestimation: " in screen
+    assert "Calibration error: " in screen
+    for suffix in ("png", "pdf"):
+        assert (run / f"Hopper-v4_critics.{suffix}").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--record", "x.mp4"], "leave out --record"),
+        (["--stochastic"], "leave out --stochastic"),
+        (["-n", "5"], "--explain needs whole episodes"),
+        (["--n-episodes", "0"], "--explain needs whole episodes"),
+    ],
+)
+def test_what_has_no_meaning_beside_explain_is_said(run, capsys, more, message):
+    with pytest.raises(SystemExit):
+        enjoy.main(["--explain", str(run), *more])
+    assert message in capsys.readouterr().err

@@ -1,0 +1,160 @@
+"""Pictures without a display."""
+
+import argparse
+import os
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_tdc.cli import enjoy, train
+from sb3_tdc.envs import rendering
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4"])
+def test_the_camera_follows_the_agent(env_id):
+    env = gym.make(env_id, render_mode="rgb_array")
+    rendering.follow_agent(env)
+    renderer = env.unwrapped.mujoco_renderer
+    assert renderer.model.camera(renderer.camera_id).name == "track"  # frames
+    assert renderer.model.body(renderer.default_cam_config["trackbodyid"]).name != "world"  # a window
+
+
+def test_a_camera_that_was_asked_for_stays():
+    env = gym.make("HalfCheetah-v5", render_mode="rgb_array", camera_id=0)
+    rendering.follow_agent(env)
+    assert env.unwrapped.mujoco_renderer.camera_id == 0
+    rendering.follow_agent(gym.make("Pendulum-v1"))  # nothing to do
+
+
+def test_no_backend_is_said_with_its_remedy(monkeypatch):
+    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(rendering, "_TRY_BACKEND", "raise SystemExit(1)")
+    with pytest.raises(ValueError, match=r"neither EGL nor OSMesa works.*apt-get install"):
+        rendering.choose_gl_backend()
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert "MUJOCO_GL=osmesa (from the environment)" in rendering.choose_gl_backend()
+
+
+# ---------------------------------------------------------------- environments of all kinds
+
+
+class Undrawn(gym.Env):
+    """Takes no ``render_mode``."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self):
+        self.steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(1, np.float32), 1.0, False, self.steps == 10, {}
+
+
+class Drawn(Undrawn):
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.full((32, 32, 3), 10 * self.steps, np.uint8) if self.render_mode == "rgb_array" else None
+
+
+class NeedsPictures(Drawn):
+    """Observes its own pictures, as pixel wrappers do."""
+
+    def reset(self, **kwargs):
+        assert self.render_mode == "rgb_array"
+        return super().reset(**kwargs)
+
+
+class Fails(Undrawn):
+    def __init__(self):
+        if os.environ.get("NO_LICENCE"):
+            raise RuntimeError("no licence")
+        super().__init__()
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A run of every kind."""
+    folder = tmp_path_factory.mktemp("runs")
+    found = {}
+    for kind in (Undrawn, Drawn, NeedsPictures, Fails):
+        gym.register(f"{kind.__name__}-v0", kind)
+        kwargs = ["--env-kwargs", "render_mode:rgb_array"] if kind is NeedsPictures else []
+        argv = ["--env", f"{kind.__name__}-v0", "-n", "20", "-f", str(folder), "--eval-freq", "-1", *kwargs]
+        assert train.main([*argv, "--verbose", "0", "-params", "policy_kwargs:{net_arch: [4]}"]) == 0
+        found[kind.__name__] = folder / "tdc" / f"{kind.__name__}-v0_1"
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Undrawn", "No window: it draws nothing\n"),
+        ("Drawn", "There is no display: no window. To see the agent: --record FILE.mp4\n"),
+        ("NeedsPictures", "No window: it is made with render_mode rgb_array. To see the agent: --record FILE.mp4\n"),
+    ],
+)
+def test_every_environment_can_be_played(runs, name, said, monkeypatch, capsys):
+    monkeypatch.setattr(enjoy, "display_works", lambda: False)
+    assert enjoy.main([str(runs[name]), "--n-episodes", "2"]) == 0
+    out = capsys.readouterr().out
+    assert said in out
+    assert "Return: 10.00 ± 0.00" in out
+
+
+@pytest.mark.parametrize("name", ["Drawn", "NeedsPictures"])
+def test_what_draws_can_be_recorded(runs, name, tmp_path):
+    assert enjoy.main([str(runs[name]), "--n-episodes", "1", "--record", str(tmp_path / "video.mp4")]) == 0
+    assert (tmp_path / "video.mp4").stat().st_size > 100
+
+
+def test_what_does_not_draw_cannot_be_recorded_and_says_so(runs, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        enjoy.main([str(runs["Undrawn"]), "--record", str(tmp_path / "video.mp4")])
+    assert "Undrawn-v0 cannot be recorded: it draws nothing" in capsys.readouterr().err
+
+
+def test_an_environment_that_cannot_be_made_is_a_sentence(runs, monkeypatch, capsys):
+    monkeypatch.setenv("NO_LICENCE", "1")
+    with pytest.raises(SystemExit) as exit_:
+        enjoy.main([str(runs["Fails"]), "--no-render"])
+    assert exit_.value.code == 2
+    assert "error: Fails-v0 cannot be made: RuntimeError: no licence (" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        enjoy.main([str(runs["Drawn"]), "--no-render", "--env-kwargs", "gravity:3"])
+    assert "error: Drawn-v0 cannot be made: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("env_id", "modes"),
+    [("Hopper-v4", {"human", "rgb_array"}), ("Undrawn-v0", set()), ("Drawn-v0", {"rgb_array"})],
+)
+def test_modes(runs, env_id, modes):
+    assert rendering.render_modes(env_id) & {"human", "rgb_array"} == modes
+
+
+def test_a_display_that_is_gone_is_not_used(monkeypatch):
+    """As after ``ssh -X`` or in an old tmux: the variable is there, and nobody listens."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    assert not rendering.display_works()
+    monkeypatch.setattr(rendering, "_TRY_BACKEND", "import os; raise SystemExit(os.environ['MUJOCO_GL'] != 'osmesa')")
+    assert rendering.choose_gl_backend() == "Rendering with MUJOCO_GL=osmesa (no display)"
+    assert os.environ.pop("MUJOCO_GL") == "osmesa"
+    args = argparse.Namespace(record=None, no_render=False)
+    assert enjoy._rendering(args, "Hopper-v4", {}) == {}

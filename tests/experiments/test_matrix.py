@@ -1,0 +1,188 @@
+"""The run matrix: what is run, for how long; then real matrices, killed and resumed."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sb3_tdc import TDC
+from sb3_tdc.cli import matrix
+from sb3_tdc.experiments import plan as planning
+from sb3_tdc.experiments.jobs import Job, eval_freq
+from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.experiments.suites import SUITES, Cell
+from sb3_tdc.runs.folder import RunFolder
+from tests.helpers.matrices import SMALL_TDC, finish, is_running, runs_of
+from tests.helpers.matrices import start_matrix as start
+from tests.helpers.run_folders import make_run
+
+
+def plan(suite, seeds=(1,), scale=0.02, only=(), logs=Path("/logs")):
+    return planning.make_plan(planning.select(SUITES[suite], only), seeds, scale, logs)
+
+
+def test_jobs_of_the_paper():
+    fig1 = plan("fig1", seeds=(1, 2))
+    assert len(fig1.jobs) == 2 * 5 * 5  # seeds × algorithms × tasks
+    assert [job.seed for job in fig1.jobs] == [1] * 25 + [2] * 25
+    assert fig1.missing == []
+    assert len(plan("fig2").jobs) == 10
+    assert len(plan("fig3").jobs) == 10
+    assert [job.settings for job in plan("figS1").jobs] == [{"lam": 0.0}, {"lam": 1.0}]
+
+
+def test_cells_of_two_suites_may_be_one_job():
+    cells = [Cell("tdc", "Humanoid-v4", {"stochastic_actor": False}), Cell("tdc", "Humanoid-v4", {"lam": 1.0})]
+    jobs = planning.make_plan(cells, (1,), 1.0, Path("/logs")).jobs  # λ is 1 there, and the head deterministic
+    assert [(job.settings, job.logs) for job in jobs] == [({}, Path("/logs/scale_1/seed_1"))]
+
+
+def test_other_simulators_are_missing_with_a_hint():
+    missing = plan("fig5").missing
+    assert "tdc on HopperBulletEnv-v0: pip install pybullet_envs_gymnasium" in missing
+    assert any("Isaac Lab" in sentence for sentence in missing)
+
+
+def test_scaled():
+    # HalfCheetah: 0.02 × 1,500,000 steps; 25,000 random steps are more than a tenth; evaluations at 1/30
+    def cheetah(scale):
+        (job,) = plan("fig1", scale=scale, only=["tdc", "HalfCheetah-v4"]).jobs
+        return job
+
+    assert (cheetah(0.02).n_timesteps, cheetah(0.02).config["learning_starts"]) == (30_000, 3000)
+    assert (cheetah(1).n_timesteps, cheetah(1).config["learning_starts"]) == (1_500_000, 25_000)
+    assert (eval_freq(30_000), eval_freq(1_500_000), eval_freq(7)) == (1000, 20_000, 1)
+    assert "-params" not in cheetah(1).arguments  # nothing differs from hyperparams/
+
+
+def test_a_suite_of_a_length_of_its_own():
+    jobs = plan("evidence", scale=1).jobs
+    assert [(job.algo, job.env_id, job.settings) for job in jobs[:4]] == [
+        ("tdc", "Hopper-v4", {}),
+        ("td3", "Hopper-v4", {}),
+        ("sac", "Hopper-v4", {}),
+        ("tdc", "Hopper-v4", {"lam": 0.0}),
+    ]
+    assert len(jobs) == 12
+    assert {job.n_timesteps for job in jobs} == {300_000}
+    assert eval_freq(300_000) == 10_000
+    assert jobs[0].logs == Path("/logs/steps_300000/seed_1")
+    assert {job.n_timesteps for job in plan("evidence", scale=0.01).jobs} == {3000}
+
+
+def test_selected():
+    assert {(c.algo, c.env_id) for c in planning.select(SUITES["fig1"], ["sac", "Ant-v4"])} == {("sac", "Ant-v4")}
+    assert len(planning.select(SUITES["fig1"], ["Ant-v4"])) == 5
+    with pytest.raises(ValueError, match="did you mean 'Hopper-v4'"):
+        planning.select(SUITES["fig1"], ["Hoper-v4"])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "n_jobs", "expected"),
+    [([], 2, 0), ([3, 3, 3], 1, 9), ([3, 3, 3], 2, 6), ([5, 1, 1, 1], 2, 5), ([1, 1, 5], 2, 6)],
+)
+def test_estimate(seconds, n_jobs, expected):
+    assert planning.estimate_seconds(seconds, n_jobs) == expected
+
+
+def test_rates_are_those_of_finished_runs(tmp_path):
+    for seed, seconds, steps in ((1, 10, 1000), (2, 20, 1000), (3, 40, 1000), (4, 1, None)):
+        folder = make_run(tmp_path, seed=seed, steps=steps)
+        (folder.path / "progress.csv").write_text(f"time/total_timesteps,time/time_elapsed\n500,1\n1000,{seconds}\n")
+    assert planning.read_rates(tmp_path) == {("tdc", "Hopper-v4"): 50}  # the median of 100, 50 and 25
+    assert planning.read_rates(tmp_path / "nothing") == {}
+
+
+def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
+    job = Job("tdc", "Pendulum-v1", 1, 100, tmp_path, {"lam": 0.5})
+    assert job.run_folder is None
+    folder = RunFolder.create(tmp_path, "tdc", "Pendulum-v1")
+    folder.write_config({**job.config, "lam": 0.7}, {"seed": 1, "eval_freq": 3})
+    with pytest.raises(ValueError, match=r"another run \(lam 0.7 instead of 0.5\)"):
+        _ = job.run_folder
+    folder.write_config(job.config, {"seed": 1, "eval_freq": 3})
+    assert (job.run_folder.path, job.steps_done) == (folder.path, 0)
+    (folder.resume_folder / "step_000000000040").mkdir(parents=True)
+    assert (job.steps_done, job.is_finished) == (40, False)
+    folder.mark_finished(100)
+    assert (job.steps_done, job.is_finished) == (100, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["figg1"], "did you mean 'fig1'"),
+        (["fig1", "--scale", "-1"], "--scale must be above 0"),
+        (["fig1", "--seeds", "0"], "at least 1"),
+        (["fig1", "--jobs", "0"], "--jobs must be at least 1"),
+        (["fig1", "--only", "ppo"], "not in the suite"),
+    ],
+)
+def test_bad_arguments(arguments, sentence, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        matrix.main([*arguments, "--logs", str(tmp_path)])
+    assert stopped.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+def test_without_ray(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SystemExit):
+        matrix.main(["figS1", "--scale", "0.001", "--logs", str(tmp_path)])
+    assert 'pip install "sb3-tdc[tune]"' in capsys.readouterr().err
+
+
+def test_dry_run_measures(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(SUITES, "fig1", [Cell("tdc", "Pendulum-v1", SMALL_TDC), Cell("advb", "Pendulum-v1")])
+    assert matrix.main(["fig1", "--seeds", "2", "--scale", "0.001", "--dry-run", "--logs", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "no ADVB" in out
+    assert out.count("run    tdc Pendulum-v1") == 2
+    assert out.count("steps/s") == 1
+    assert "2 of 2 to run" in out
+    assert not any(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- real matrices
+
+
+def fingerprint(run):
+    state = TDC.load(run.folder.model, device="cpu").policy.state_dict()
+    return {key: value.tolist() for key, value in state.items()}, run.evaluations.returns.tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_matrix_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
+    scale = ["--scale", "0.003", "--jobs", "2"]  # 3,000 steps
+    out, status = finish(start("fig1", tmp_path / "alone", *scale))
+    assert status == 0, out
+
+    process = start("fig1", tmp_path / "killed", *scale)
+    deadline = time.monotonic() + 200
+    while len(list((tmp_path / "killed").rglob("resume/step_000000000[1-9]*"))) < 2:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    family = runs_of(process.pid)
+    assert family
+    os.kill(process.pid, how)
+    out, status = finish(process)
+    assert status == {signal.SIGKILL: -9, signal.SIGINT: 130}[how], out
+    deadline = time.monotonic() + 30
+    while any(is_running(pid) for pid in family):  # nothing goes on alone
+        assert time.monotonic() < deadline, [pid for pid in family if is_running(pid)]
+        time.sleep(0.1)
+    assert not all(r.is_finished for r in find_runs(tmp_path / "killed")[0])
+
+    out, status = finish(start("fig1", tmp_path / "killed", *scale))
+    assert status == 0, out
+    assert "resume tdc" in out
+    alone, killed = (find_runs(tmp_path / name)[0] for name in ("alone", "killed"))
+    assert len(alone) == len(killed) == 2
+    for one, other in zip(alone, killed, strict=True):
+        assert fingerprint(one) == fingerprint(other)

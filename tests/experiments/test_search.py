@@ -1,0 +1,187 @@
+"""The λ search: its candidates and its ranking; then real searches, killed and resumed."""
+
+import os
+import signal
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+
+from sb3_tdc.cli import train, tune
+from sb3_tdc.experiments import ranking, search, trials
+from sb3_tdc.experiments.jobs import Job
+from sb3_tdc.experiments.search_space import LAMBDAS, Distribution, make_candidates, parse_space
+from sb3_tdc.runs.folder import RunFolder
+from tests.helpers.matrices import is_running, runs_of
+from tests.helpers.searches import arguments
+from tests.helpers.searches import start_search as start
+
+
+def test_space():
+    assert LAMBDAS == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]
+    space = parse_space(["lam:[0.5, 1]", "tau: loguniform(1e-4, 1e-2)", "policy_delay:randint(1,3)"])
+    assert space == {
+        "lam": [0.5, 1],
+        "tau": Distribution("loguniform", 1e-4, 1e-2),
+        "policy_delay": Distribution("randint", 1, 3),
+    }
+    candidates = make_candidates(space, 4)
+    assert len(candidates) == 2 * 4
+    assert [c["lam"] for c in candidates] == [0.5] * 4 + [1] * 4
+    assert [c["tau"] for c in candidates[:4]] == [c["tau"] for c in candidates[4:]]  # the same draws for both λ
+    assert all(1e-4 <= c["tau"] <= 1e-2 and c["policy_delay"] in (1, 2, 3) for c in candidates)
+    assert make_candidates(space, 4) == candidates
+    assert make_candidates({"lam": [0.5]}, 99) == [{"lam": 0.5}]
+    few = make_candidates({"policy_delay": Distribution("randint", 1, 3)}, 30)
+    assert sorted(c["policy_delay"] for c in few) == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lam", "lam:", "lam:0.5", "lam:[]", "lam:[0.5", "lam:__import__('os').getcwd()", "lam:normal(0,1)",
+        "lam:uniform(1,0)", "lam:loguniform(0,1)", "lam:uniform(a,b)", "lam:uniform(0,inf)", "lam:randint(0.5,2)",
+    ],
+)  # fmt: skip
+def test_spaces_that_are_none(text):
+    with pytest.raises(ValueError, match="--search"):
+        parse_space([text])
+
+
+def make_candidate(folder, lam, returns):
+    """:param returns: of each seed, the mean of every evaluation"""
+    jobs = []
+    for seed, values in enumerate(returns, start=1):
+        job = Job("tdc", "Hopper-v4", seed, 1500, folder / f"{lam}" / f"{seed}", {"lam": lam})
+        run = RunFolder.create(job.logs, "tdc", "Hopper-v4")
+        run.write_config(job.config, {"algo": "tdc", "env": "Hopper-v4", "seed": seed, "eval_freq": 50})
+        episodes = np.array(values)[:, None] + [-1, 1]
+        np.savez(run.path / "evaluations.npz", timesteps=50 * np.arange(1, len(values) + 1), results=episodes)
+        jobs.append(job)
+    return jobs
+
+
+def test_ranking_by_hand(tmp_path):
+    candidates = [
+        make_candidate(tmp_path, 0.1, [[1, 3], [3, 5]]),  # means 2 and 4
+        make_candidate(tmp_path, 0.2, [[4, 6], [5, 7]]),  # 5 and 6
+        make_candidate(tmp_path, 0.3, [[9, 1], [9]]),  # both have one evaluation
+    ]
+    table = ranking.rank(candidates, ["lam"])
+    assert table["lam"].tolist() == [0.2, 0.1, 0.3]
+    assert table["mean"].tolist() == [5.5, 3, 9]
+    assert table["steps"].tolist() == [100, 100, 50]
+    assert table["std"].tolist() == pytest.approx([np.sqrt(0.5), np.sqrt(2), 0])
+    ranking.write_results(tmp_path, candidates, ["lam"])
+    best = yaml.safe_load((tmp_path / "best.yml").read_text())["Hopper-v4"]
+    assert (best["lam"], best["n_timesteps"]) == (0.2, 1_500_000)
+    assert (tmp_path / "lam.png").stat().st_size > 5_000
+
+
+def test_trials(tmp_path):
+    candidates = [
+        [Job("tdc", "Hopper-v4", seed, 10, tmp_path, {"tau": 0.1, "lam": lam}) for seed in (1, 2)] for lam in (0.0, 1.0)
+    ]
+    assert list(map(len, trials.make_trials(candidates, ["lam"], side_by_side=False).values())) == [1] * 4
+    assert trials.make_trials(candidates, ["lam"], side_by_side=True) == {
+        "lam 0.0, 2 seeds": candidates[0],
+        "lam 1.0, 2 seeds": candidates[1],
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--algo", "tcd"], "did you mean 'tdc'"),
+        (["--env", "Hoper-v4"], "did you mean Hopper"),
+        (["--algo", "sac"], "sac has no λ"),
+        (["--search", "lamm:[1.0]"], "did you mean 'lam'"),
+        (["--search", "lam:[high]"], "lam must be"),
+        (["--search", "lam:[-1.0]"], "lam must be"),
+        (["--gym-packages", "no_such_package"], "pip install no_such_package"),
+        (["-n", "0"], "-n must be at least 1"),
+        (["--seeds", "0"], "--seeds must be at least 1"),
+        (["--asha", "--seeds", "3", "--jobs", "2"], "3 seeds need as many CPUs"),
+    ],
+)
+def test_bad_arguments(arguments, sentence, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        tune.main([*arguments, "--logs", str(tmp_path)])
+    assert stopped.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- real searches
+
+
+def finish(process):
+    return process.communicate(timeout=300)[0], process.returncode
+
+
+@pytest.mark.slow
+def test_a_search_that_is_killed_goes_on_to_the_same_end(tmp_path):
+    options = ["--search", "lam:[0.0, 1.0]"]
+    out, status = finish(start(*arguments(tmp_path / "alone", 2000), *options))
+    assert status == 0, out
+    alone, killed = (tmp_path / name / "search/tdc/Pendulum-v1_1" for name in ("alone", "killed"))
+
+    process = start(*arguments(tmp_path / "killed", 2000), *options)
+    deadline = time.monotonic() + 200
+    while not list(killed.rglob("finished.yml")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    family = runs_of(process.pid)
+    assert family
+    os.kill(process.pid, signal.SIGKILL)
+    finish(process)
+    deadline = time.monotonic() + 30
+    while any(is_running(pid) for pid in family):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert len(list(killed.rglob("finished.yml"))) < 4
+    out, status = finish(start("--resume", killed))
+    assert status == 0, out
+    assert (killed / "ranking.csv").read_text() == (alone / "ranking.csv").read_text()
+    best = yaml.safe_load((killed / "best.yml").read_text())["Pendulum-v1"]
+    assert best["lam"] in (0.0, 1.0)
+    command = ["--env", "Pendulum-v1", "-conf", str(killed / "best.yml"), "-n", "50", "-f", str(tmp_path / "best")]
+    assert train.main([*command, "--eval-freq", "-1", "--num-threads", "1", "--device", "cpu"]) == 0
+    assert RunFolder.find(tmp_path / "best", "tdc", "Pendulum-v1").config["lam"] == best["lam"]
+
+
+@pytest.mark.slow
+def test_asha_stops_whole_candidates(tmp_path):
+    out, status = finish(start(*arguments(tmp_path), "--asha", "--search", "lam:[0.0, 0.3, 0.6, 1.0]"))
+    assert status == 0, out
+    folder = tmp_path / "search/tdc/Pendulum-v1_1"
+    finished = [len(list(candidate.rglob("finished.yml"))) for candidate in folder.glob("candidate_*")]
+    assert len(finished) == 4
+    assert all(n in (0, 2) for n in finished)
+    assert 2 in finished
+
+
+class NeedsKwargs(gym.Env):
+    """Cannot be made by its id alone, and its wrapper changes what is observed."""
+
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, size):
+        self.observation_space = gym.spaces.Box(-1, 1, (size,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+
+def test_candidates_are_checked_on_the_environment_of_the_runs(monkeypatch):
+    gym.register("NeedsKwargs-v0", NeedsKwargs)
+    settings = {"env_kwargs": {"size": 3}, "env_wrapper": "gymnasium.wrappers.FlattenObservation"}
+    search.check("tdc", "NeedsKwargs-v0", settings)
+    with pytest.raises(ValueError, match=r"--search and -params: .*size"):
+        search.check("tdc", "NeedsKwargs-v0", {})
+    with pytest.raises(ValueError, match=r"--search and -params: .*policy_delay"):
+        search.check("tdc", "NeedsKwargs-v0", {**settings, "policy_delay": 0})

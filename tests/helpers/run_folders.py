@@ -1,0 +1,33 @@
+"""Run folders as a training leaves them, made in no time."""
+
+import json
+import zipfile
+
+import numpy as np
+
+from sb3_tdc.runs.folder import RunFolder
+
+NETWORKS = {"net_arch": [256, 256], "n_quantiles": 64}
+
+
+HOPPER = {
+    "lam": 0.9,
+    "learning_rate": 2e-4,
+    "qf_learning_rate": 2e-4,
+    "policy_kwargs": NETWORKS,
+    "n_timesteps": 1000,
+}
+
+
+def make_run(folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=(), returns=((1.0, 3.0),), **config):
+    """:param steps: taken; None if no model was saved"""
+    run = RunFolder.create(folder, algo, env_id)
+    config = {**(HOPPER if algo == "tdc" else {"n_timesteps": 1000}), **config}
+    run.write_config(config, {"algo": algo, "env": env_id, "seed": seed, **dict(args)})
+    timesteps = np.linspace(0, steps or 500, len(returns) + 1)[1:]
+    np.savez(run.path / "evaluations.npz", timesteps=timesteps, results=returns)
+    if steps is not None:
+        with zipfile.ZipFile(run.model, "w") as archive:
+            archive.writestr("data", json.dumps({"num_timesteps": steps}))
+            archive.writestr("system_info.txt", "- OS: of the test\n- Python: 3\n")
+    return run

@@ -1,0 +1,59 @@
+"""A run that is stopped in mid-episode and resumed in a new process is the run that was never stopped, bit by bit."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.tools.runs import CASES, CROSS, OTHERS
+
+ROOT = Path(__file__).parents[2]
+SLOW = [
+    *CROSS,
+    "readable update",
+    "ring overwritten, two environments",
+    "SAC",
+    "TQC, gSDE",
+    "HER with infos",
+    "AdvB-SAC",
+]
+QUICK = ["Ant-v4-dummy1-plain", "Humanoid-v4-dummy2-gaussian", "Hopper-v4-subproc2-plain"]
+QUICK += [name for name in OTHERS if name not in SLOW]
+
+
+def run_process(mode, folder, names):
+    command = [sys.executable, "-W", "ignore", "-m", "tests.tools.runs", mode, str(folder), *names]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+
+
+def differences(folder, names):
+    """Three processes: never stopped, stopped, resumed."""
+    for mode in ("whole", "stopped", "resumed"):
+        run_process(mode, folder, names)
+    whole, resumed = (json.loads((folder / f"{mode}.json").read_text()) for mode in ("whole", "resumed"))
+    return {
+        name: [key for key in whole[name] | resumed[name] if whole[name].get(key) != resumed[name].get(key)]
+        for name in names
+    }, whole
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    return differences(tmp_path_factory.mktemp("parity"), QUICK)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_resumed_is_uninterrupted(quick, name):
+    found, whole = quick
+    assert found[name] == []
+    assert len(whole[name]) > 25  # there was something to compare
+    assert whole[name]["number of transitions"] >= CASES[name].steps / CASES[name].n_envs
+
+
+@pytest.mark.slow
+def test_the_whole_cross(tmp_path):
+    names = [name for name in SLOW if name not in QUICK]
+    assert differences(tmp_path, names)[0] == {name: [] for name in names}

@@ -1,0 +1,381 @@
+"""``train.py --resume`` and ``ResumeStates``: what a user sees when a run is stopped, damaged, or not what it was."""
+
+import errno
+import functools
+import hashlib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from gymnasium.envs.classic_control import PendulumEnv
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_tdc import TDC
+from sb3_tdc.resume import Restorable, ResumeStates, callback
+from sb3_tdc.resume import run_state as state
+from sb3_tdc.runs.callbacks import busy_machine
+from sb3_tdc.runs.callbacks import stopping as interruption
+from sb3_tdc.runs.callbacks.progress import ProgressCallback
+from tests.helpers.training import SMALL, fails, outcome, resume, run_train
+from tests.tools import kill
+from tests.tools.runs import Stop, StopAt
+
+
+def test_a_signal_loses_nothing(tmp_path, stop_at, monkeypatch, whole, capsys):
+    stop_at(270)
+    assert run_train(tmp_path) == 130
+    monkeypatch.undo()
+    stopped = tmp_path / "tdc" / "Hopper-v4_1"
+    screen = capsys.readouterr().out
+    assert "Stopped at step 271 of 400." in screen  # the step after, which is done again
+    assert "To continue from step 270:" in screen
+    assert f"sb3-tdc train --resume {stopped}" in screen
+    assert resume(stopped) == 0
+    screen = capsys.readouterr().out
+    assert "Resuming tdc on Hopper-v4, seed 1" in screen
+    assert "Continuing from step 270" in screen
+    assert outcome(stopped) == whole
+    assert not (stopped / "resume").exists()  # of no use any more
+
+
+def test_a_run_on_a_busy_machine_goes_on_with_another_number_of_threads(tmp_path, monkeypatch, whole):
+    """Stopped when it says that one thread is faster. The threads are told, not changed, so that the results stay."""
+    threads, messages = [2], []
+
+    def say(progress, text):
+        messages.append(text)
+        if len(messages) == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(th, "get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr(th, "set_num_threads", threads.append)
+    with monkeypatch.context() as busy:
+        busy.setattr(busy_machine, "_WINDOW_SECONDS", 0.0)
+        busy.setattr(busy_machine, "_SHARE", float("inf"))
+        busy.setattr(busy_machine, "_WASTE", 0.0)
+        busy.setattr(ProgressCallback, "say", say)
+        assert run_train(tmp_path, "--num-threads", "2") == 130
+        stopped = tmp_path / "tdc" / "Hopper-v4_1"
+        shutil.copytree(stopped, tmp_path / "copy")
+        assert resume(tmp_path / "copy") == 0
+        assert len(messages) == 2  # a process does not know what the one before has said
+    time.sleep(1)  # TensorBoard reads the files of one process and one second in the order of their names: 10 before 8
+    with pytest.warns(RuntimeWarning, match="threads of torch was 2, is 1"):
+        assert resume(stopped, "--num-threads", "1") == 0
+    assert outcome(stopped) == whole
+
+
+def test_a_finished_run_is_left_alone(tmp_path, capsys):
+    assert run_train(tmp_path, n=150) == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    capsys.readouterr()
+    assert resume(folder) == 0
+    assert capsys.readouterr().out == f"{folder} is finished: there is nothing to resume\n"
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_starting_over_needs_consent(stopped, whole, capsys):
+    shutil.rmtree(stopped / "resume")
+    before = {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()}
+    assert "--start-over begins at step 0 again" in fails(lambda: resume(stopped), capsys)
+    assert {path: path.read_bytes() for path in stopped.rglob("*") if path.is_file()} == before
+    assert resume(stopped, "--start-over") == 0
+    assert outcome(stopped) == whole
+
+
+def test_starting_over_removes_states_that_are_there(stopped, whole, capsys):
+    assert resume(stopped, "--start-over") == 0
+    assert "Going on from" not in capsys.readouterr().out
+    assert outcome(stopped) == whole
+
+
+def test_a_run_that_was_stopped_before_its_first_step_begins_again(tmp_path, whole, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(ResumeStates, "_write", lambda *args: os.kill(os.getpid(), signal.SIGKILL))
+        if (child := os.fork()) == 0:
+            run_train(tmp_path)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert resume(tmp_path / "tdc" / "Hopper-v4_1") == 0
+    assert outcome(tmp_path / "tdc" / "Hopper-v4_1") == whole
+
+
+def test_a_damaged_state_costs_only_the_way_from_the_one_before(stopped, whole):
+    newest = max((stopped / "resume").glob("step_*"))
+    (newest / "weights.pt").write_bytes((newest / "weights.pt").read_bytes()[:-1])
+    with pytest.warns(RuntimeWarning, match=r"weights.pt is damaged; going back to the state of step 269"):
+        assert resume(stopped) == 0
+    assert outcome(stopped) == whole
+
+
+def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
+    for args, message in (
+        (["--seed", "3"], f"--seed 3 contradicts the run in {stopped}: --seed 1"),
+        (["--algo", "sac"], "--algo sac contradicts the run in"),
+        (["-n", "500"], "--n-timesteps 500 contradicts the run in"),
+        (["-params", "buffer_size:5"], "buffer_size cannot be changed when a run is resumed; learning_rate, "),
+        (["-params", "lamb:0.5"], "command line (-params): unknown key 'lamb'; did you mean 'lam'?"),
+        (["--from", "100"], "has no state of step 100; there are: 270, 269, "),
+    ):
+        assert message in fails(lambda args=args: resume(stopped, *args), capsys)
+    assert "is not the folder of a run" in fails(lambda: resume(tmp_path), capsys)
+    for manifest in (stopped / "resume").glob("*/manifest"):
+        manifest.unlink()
+    assert "No state in" in fails(lambda: resume(stopped), capsys)
+    assert len(list((stopped / "resume").glob("step_*"))) == 4  # nothing was thrown away
+    args = yaml.safe_load((stopped / "Hopper-v4" / "args.yml").read_text())
+    (stopped / "Hopper-v4" / "args.yml").write_text(yaml.safe_dump({**args, "resume_freq": -1}))
+    assert "has no resume states" in fails(lambda: resume(stopped), capsys)
+    (stopped / "Hopper-v4" / "args.yml").unlink()
+    assert "was stopped before its run began" in fails(lambda: resume(stopped), capsys)
+
+
+def test_the_same_arguments_are_no_contradiction(stopped, whole):
+    assert resume(stopped, "--env", "Hopper-v4", "--seed", "1", "--verbose", "0") == 0
+    assert outcome(stopped) == whole
+
+
+def test_a_full_disk_stops_nothing_but_the_state(tmp_path, whole, monkeypatch, stop_at):
+    """From step 100 to 250 nothing can be synced: no state is written, and the one before stays."""
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    write = ResumeStates._write
+
+    def full(self, step):
+        with monkeypatch.context() as patch:
+            if 100 <= step <= 250:
+                patch.setattr(os, "fsync", no_space)
+            write(self, step)
+
+    def no_space(descriptor):
+        assert list((folder / "resume").glob("step_*"))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(ResumeStates, "_write", full)
+    stop_at(300)
+    with pytest.warns(
+        RuntimeWarning, match=r"could not be written .*No space left.* Training continues; that of step 80"
+    ):
+        assert run_train(tmp_path) == 130
+    monkeypatch.undo()
+    assert resume(folder) == 0
+    assert outcome(folder) == whole
+
+
+def test_a_full_disk_does_not_stop_an_evaluation(tmp_path, monkeypatch):
+    def full(self, path, *args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    save = TDC.save
+    monkeypatch.setattr(TDC, "save", lambda self, path: (full if "best" in str(path) else save)(self, path))
+    with pytest.warns(UserWarning, match=r"best model of step 150 was not saved.*No space left"):
+        assert run_train(tmp_path, n=200) == 0
+
+
+def test_a_signal_does_not_wait_for_the_end_of_an_endless_episode(tmp_path, capsys, monkeypatch, stop_at):
+    gym.register("Endless-v1", PendulumEnv)
+    monkeypatch.setattr(interruption, "_PATIENCE_SECONDS", 0.3)
+    stop_at(200)
+    start = time.monotonic()
+    episodes = [*SMALL, "train_freq:[1, episode]"]
+    assert run_train(tmp_path, "--eval-freq", -1, env="Endless-v1", n=1_000_000, small=episodes) == 130
+    assert time.monotonic() - start < 60
+    assert "To continue from step 0:" in capsys.readouterr().out
+
+
+def test_several_kills(tmp_path):
+    """Fewer than ``python -m tests.tools.kill`` makes."""
+    assert kill.main(["--kills", "3", "--steps", "3000", "--longest", "0.4", "--folder", str(tmp_path)]) == 0
+
+
+# ---------------------------------------------------------------- in Python
+
+
+def make_model(env="Pendulum-v1", algorithm=TDC, seed=1, **kwargs):
+    defaults = {"learning_starts": 20, "batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8, 8]}}
+    policy = "MultiInputPolicy" if kwargs.pop("multi_input", False) else "MlpPolicy"
+    return algorithm(policy, env, seed=seed, device="cpu", **{**defaults, **kwargs})
+
+
+def learn(model, folder, stop_at=None, steps=150, **kwargs):
+    states = ResumeStates(folder, freq=20, verbose=0, **kwargs)
+    try:
+        restored = states.select(model)
+        model.learn(steps, callback=[states, StopAt(stop_at)])
+    except Stop:
+        pass
+    finally:
+        states.store.close()
+    return restored
+
+
+def test_a_state_of_another_run_is_refused(tmp_path):
+    learn(make_model(), tmp_path, stop_at=70)
+    for model, difference in (
+        (make_model(algorithm=SAC), "the algorithm was sb3_tdc.tdc.tdc.TDC, and is stable_baselines3.sac.sac.SAC"),
+        (make_model("MountainCarContinuous-v0"), "the environment was Pendulum-v1, and is MountainCarContinuous-v0"),
+        (make_model(policy_kwargs={"net_arch": [4]}), "the network is another"),
+        (make_model(buffer_size=400), "the size of the replay buffer was 500, and is 400"),
+        (make_model(make_vec_env("Pendulum-v1", 2)), "the number of environments was 1, and is 2"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(difference)):
+            learn(model, tmp_path)
+    model, states = make_model(), ResumeStates(tmp_path)
+    with pytest.raises(ValueError, match="has states of a run already: call select"):
+        model.learn(10, callback=states)
+    states.store.close()
+
+
+def test_other_callbacks_are_noticed(tmp_path):
+    learn(make_model(), tmp_path, stop_at=70)
+    model, states = make_model(), ResumeStates(tmp_path)
+    states.select(model)
+    with pytest.raises(ValueError, match="callbacks"):
+        model.learn(100, callback=states)
+    states.store.close()
+
+
+def test_another_platform_is_named(tmp_path, monkeypatch):
+    learn(make_model(), tmp_path, stop_at=70)
+    here = state.describe_platform(make_model())
+    monkeypatch.setattr(state, "describe_platform", lambda model: {**here, "torch": "9.9"})
+    with pytest.warns(RuntimeWarning, match=f"torch was {re.escape(here['torch'])}, is 9.9$"):
+        learn(make_model(), tmp_path)
+
+
+class Locked(PendulumEnv):
+    """Python cannot see into a lock, so this cannot be captured."""
+
+    def __init__(self):
+        super().__init__()
+        self.lock = threading.Lock()
+
+
+gym.register("Locked-v0", Locked, max_episode_steps=1000)
+
+
+@pytest.mark.parametrize(("vec_env", "kwargs"), [(None, {}), (None, {"n_steps": 3}), (SubprocVecEnv, {})], ids=str)
+def test_an_environment_that_cannot_be_captured_starts_its_episode_again(tmp_path, vec_env, kwargs):
+    def make():
+        if vec_env is None:
+            return make_model("Locked-v0", **kwargs)
+        return make_model(make_vec_env(Locked, 2, vec_env_cls=vec_env, wrapper_class=Restorable), **kwargs)
+
+    learn(make(), tmp_path, stop_at=70)
+    model = make()
+    seen = {}
+    original = callback.ResumeStates._restore
+
+    def look(self):
+        original(self)
+        seen.update(pos=model.replay_buffer.pos, updates=model._n_updates)
+        seen["last"] = model.replay_buffer.dones[seen["pos"] - 1].copy(), model.replay_buffer.timeouts[seen["pos"] - 1]
+        seen["observations"] = model._last_obs.copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(callback.ResumeStates, "_restore", look)
+        with pytest.warns(RuntimeWarning, match=r"with new episodes.*lock is a _thread.lock"):
+            assert learn(model, tmp_path) == 60
+    assert seen["pos"] == 60 // model.n_envs
+    assert seen["updates"] > 0
+    assert all((part == 1).all() for part in seen["last"])  # cut off there, as by a time limit
+    assert model.num_timesteps == 150
+    # The generators go on: this is not the first episode again
+    assert not np.isclose(seen["observations"], make().env.reset()).all(axis=-1).any()
+
+
+def test_processes_without_the_wrapper_are_told_about_it(tmp_path):
+    def make():
+        return make_model(make_vec_env("Pendulum-v1", 2, vec_env_cls=SubprocVecEnv))
+
+    learn(make(), tmp_path, stop_at=70)
+    with pytest.warns(RuntimeWarning, match=r"wrap its environments in sb3_tdc.resume.Restorable"):
+        learn(make(), tmp_path)
+
+
+def cyclic():
+    """A tuple that contains itself, through a partial: it cannot be made piece by piece."""
+    parts = []
+    parts.append((parts, iter(())))
+    return parts
+
+
+def deep(n):
+    return functools.reduce(lambda inside, _: [inside], range(n), [])
+
+
+@pytest.mark.parametrize("what", [threading.Lock(), random.SystemRandom(), cyclic(), deep(5_000)], ids=type)
+def test_an_attribute_of_the_algorithm_that_cannot_be_captured_is_left_out_and_named(tmp_path, what):
+    model = make_model()
+    model.extra = what
+    with pytest.warns(RuntimeWarning, match=r"Not in the resume states: model\.extra.* (is a|is nested)"):
+        learn(model, tmp_path, stop_at=70)
+    model = make_model()
+    model.extra = "as built"
+    assert learn(model, tmp_path) == 60
+    assert model.extra == "as built"
+    assert model.num_timesteps == 150
+
+
+def test_arguments_out_of_range(tmp_path):
+    for name in ("freq", "keep"):
+        with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+            ResumeStates(tmp_path, **{name: 0})
+
+
+def test_nothing_is_pickled(tmp_path):
+    """Every file is JSON, arrays without objects, or weights; a pickle that was put in their place is not executed."""
+    learn(make_model(), tmp_path, stop_at=70)
+    kinds = {path.suffix for path in tmp_path.rglob("*") if path.is_file()} - {""}
+    assert kinds == {".json", ".npz", ".pt"}
+    for path in tmp_path.rglob("*.npz"):
+        with np.load(path, allow_pickle=False) as arrays:
+            assert all(arrays[name].dtype != object for name in arrays.files)
+    newest = max(tmp_path.glob("step_*"))
+    json.loads((newest / "state.json").read_text())
+    th.load(newest / "weights.pt", weights_only=True)
+
+    class Poison:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "executed",)
+
+    th.save({"state_dicts": Poison()}, newest / "weights.pt")
+    np.savez(newest / "arrays.npz", **{"0": np.array([Poison()], dtype=object)})
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        patch.setattr("sb3_tdc.resume.store._sha256", lambda path: _digest_of(newest, path))
+        with pytest.raises(Exception, match=r"[Ww]eights|pickle"):
+            learn(make_model(), tmp_path)
+    assert not (tmp_path / "executed").exists()
+
+
+def _digest_of(folder, path):
+    """As if the manifest had been forged too."""
+    manifest = json.loads((folder / "manifest").read_text().splitlines()[0])
+    known = {**manifest["files"], **manifest["shared"]}
+    return known.get(path.name, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+def test_what_is_written_is_what_was_added(tmp_path):
+    """Bytes in proportion to the transitions since the last state; the ring's old parts go."""
+    model = make_model(buffer_size=200)
+    learn(model, tmp_path, steps=1000)
+    segments = sorted((tmp_path / "replay").iterdir())
+    sizes = [path.stat().st_size for path in segments]
+    assert max(sizes) < 1.1 * min(sizes)
+    # 200 transitions, 20 a state, for the two newest, one 10 to 20 states older, and the next of these
+    assert 20 <= len(segments) <= 32
+    assert len(list(tmp_path.glob("step_*"))) == 4

@@ -1,0 +1,151 @@
+"""ResumeStates on disk: whole or not at all, and what happens to those that are damaged."""
+
+import errno
+import os
+import warnings
+
+import pytest
+
+from sb3_tdc.resume.store import BrokenStateError, Store
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path / "resume", keep=2, span=0)
+    yield store
+    store.close()
+
+
+def write(store, step, content=b"content", shared=None):
+    shared = dict(shared or {})
+    shared[f"ring_{step}"] = store.write_shared(f"ring_{step}", lambda path: path.write_bytes(b"ring" * step))
+    store.write(step, {"a": lambda path: path.write_bytes(content), "b": lambda path: path.write_bytes(b"b")}, shared)
+    store.remove_old()
+    return shared
+
+
+def names(folder):
+    return sorted(path.name for path in folder.rglob("*") if path.is_file())
+
+
+def test_the_newest_are_kept_with_what_they_need(store):
+    assert store.newest() is None
+    shared = write(store, 1)
+    shared = write(store, 2, shared=shared)
+    write(store, 3, shared={"ring_2": shared["ring_2"]})
+    assert store.steps() == [3, 2]
+    assert store.newest().step == 3
+    # Step 2 still needs ring_1
+    assert names(store.folder / "replay") == ["ring_1", "ring_2", "ring_3"]
+    write(store, 4)
+    assert names(store.folder / "replay") == ["ring_2", "ring_3", "ring_4"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        newest = store.newest()
+    assert (newest.step, (newest.path / "a").read_bytes()) == (4, b"content")
+    assert newest.shared_file("ring_4").read_bytes() == b"ring" * 4
+
+
+def damage(path, how):
+    content = path.read_bytes()
+    if how == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif how == "flipped":
+        path.write_bytes(bytes([content[0] ^ 1]) + content[1:])
+    elif how == "empty":
+        path.write_bytes(b"")
+    else:
+        path.unlink()
+
+
+@pytest.mark.parametrize("how", ["truncated", "flipped", "empty", "missing"])
+@pytest.mark.parametrize("name", ["step_000000000002/a", "step_000000000002/manifest", "replay/ring_2"])
+def test_damage_goes_back_to_the_one_before_and_says_so(store, how, name):
+    write(store, 1)
+    write(store, 2)
+    damage(store.folder / name, how)
+    with pytest.warns(RuntimeWarning, match=r"(damaged|missing|cannot be read).*going back to the state of step 1"):
+        assert store.newest().step == 1
+    damage(store.folder / "step_000000000001" / "b", how)
+    with pytest.raises(BrokenStateError, match=r"No state in .* is intact"):
+        store.newest()
+
+
+def test_any_flipped_bit_of_a_manifest_is_noticed(store):
+    write(store, 1)
+    manifest = store.folder / "step_000000000001" / "manifest"
+    content = manifest.read_bytes()
+    for i in range(0, len(content) - 1, 7):
+        manifest.write_bytes(content[:i] + bytes([content[i] ^ 2]) + content[i + 1 :])
+        with pytest.raises(BrokenStateError):
+            store.newest()
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_an_interruption_at_any_instant_leaves_the_one_before(store, monkeypatch, call):
+    """Every sync and every rename is one at which the process could be killed."""
+    write(store, 1)
+    original = getattr(os, call)
+    for instant in range(20):
+        calls = 0
+
+        def interrupted(*args, at=instant, **kwargs):
+            nonlocal calls
+            calls += 1
+            if calls > at:
+                raise KeyboardInterrupt
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(os, call, interrupted)
+        try:
+            write(store, 2)
+        except KeyboardInterrupt:
+            pass
+        else:
+            break
+        finally:
+            monkeypatch.undo()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert store.newest().step in (1, 2)
+        store.remove_after(1)
+    assert instant > 1
+    store.remove_old()
+    assert not list(store.folder.glob(".*"))
+
+
+def test_a_full_disk_leaves_no_trace(store, monkeypatch):
+    write(store, 1)
+    before = names(store.folder)
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            write(store, 2)
+    assert names(store.folder) == before
+    assert store.newest().step == 1
+
+
+def test_one_process_at_a_time(store):
+    with pytest.raises(ValueError, match="Another process writes resume states"):
+        Store(store.folder, 2, 0)
+    store.close()
+    Store(store.folder, 2, 0).close()
+
+
+def test_there_is_always_an_older_one_to_go_back_to(tmp_path):
+    store = Store(tmp_path / "resume", keep=2, span=50)
+    for step in range(0, 400, 7):
+        write(store, step)
+        steps = store.steps()
+        assert steps[:2] == [s for s in (step, step - 7) if s >= 0]
+        assert len(steps) <= 4
+        if step >= 50:
+            assert any(50 <= step - s <= 100 + 7 for s in steps)
+        assert all(store.at(s).step == s for s in steps)  # with the shared files that they need
+    with pytest.raises(ValueError, match=r"no state of step 1; there are: 399, 392, \d+, \d+$"):
+        store.at(1)
+    store.close()

@@ -1,0 +1,321 @@
+"""What a callback holds comes back as it was, its class too, or is named; nothing of it ends training."""
+
+import io
+import json
+import re
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+
+from sb3_tdc.resume import ResumeStates
+from sb3_tdc.resume import run_state as state
+from sb3_tdc.resume.kinds.table import KINDS
+from tests.helpers.values import BOXES, LEAVES, Node, alike, build
+from tests.tools.runs import Stop, StopAt
+
+
+class Holds(BaseCallback):
+    """A user's callback."""
+
+    def __init__(self, *values):
+        super().__init__()
+        self.x, self.y = values
+
+    def _on_step(self):
+        return True
+
+
+class Still(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+def make_model():
+    small = {"policy_kwargs": {"net_arch": [2]}, "buffer_size": 10, "learning_starts": 100, "device": "cpu"}
+    return SAC("MlpPolicy", Still(), seed=1, **small)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_model().learn(1)
+
+
+def there_and_back(model, before, after):
+    """
+    As in two processes: what is built holds ``before``; what is captured, ``after``.
+
+    :return: what the second process holds in the end, and all that was named
+    """
+    first = Holds(*build_both(before))
+    root = CallbackList([first])
+    _, initial = state.verify(model, root)
+    first.x, first.y = now = build_both(after)
+    parts, context = state.capture_state(model, root, initial)
+    text, file = json.dumps(parts), io.BytesIO()
+    np.savez(file, allow_pickle=False, **{str(i): array for i, array in enumerate(context.arrays)})
+    named = list(context.left_out)
+
+    second = Holds(*build_both(before))
+    root = CallbackList([second])
+    state.verify(model, root)
+    with np.load(io.BytesIO(file.getvalue()), allow_pickle=False) as arrays:
+        numbered = [arrays[str(i)] for i in range(len(arrays.files))]
+    context = state.restoring(model, numbered)
+    state.restore_state(model, root, json.loads(text), context)
+    assert context.not_restored == []  # it was known when it was captured
+    return now, [second.x, second.y], named
+
+
+def build_both(recipes):
+    built = []
+    return [build(recipe, built) for recipe in recipes]
+
+
+recipes = st.recursive(
+    st.sampled_from(sorted(LEAVES)) | st.tuples(st.just("same"), st.integers(0, 5)),
+    lambda parts: st.tuples(st.sampled_from(sorted(BOXES)), st.lists(parts, max_size=4)),
+    max_leaves=8,
+)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.tuples(recipes, recipes), st.tuples(recipes, recipes))
+def test_whatever_a_callback_holds_comes_back_or_is_named(model, before, after):
+    now, restored, named = there_and_back(model, before, after)
+    if not named:
+        assert alike(now, restored)
+        return
+    original = build_both(before)
+    for name, value, found, built in zip("xy", now, restored, original, strict=True):
+        # What one attribute shares with the other may be reached by it alone
+        if any(re.match(rf"callbacks\.callbacks\[0\]\.{name}\b|.* share their memory", why) for why in named):
+            continue
+        assert alike(value, found), (named, built)
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+@pytest.mark.parametrize("before", ["None", "list", "itself"])
+def test_every_kind_comes_back_or_is_named(model, leaf, before):
+    """Where there was nothing, in a list that grows, and where there was the same."""
+    now, there = {"None": (leaf, "None"), "list": (("list", [leaf, leaf]), ("list", [])), "itself": (leaf, leaf)}[
+        before
+    ]
+    value, restored, named = there_and_back(model, (there, "None"), (now, "None"))
+    assert named or alike(value, restored)
+    assert all(why.startswith("callbacks.callbacks[0].x") for why in named)
+
+
+# Those that a user may expect to be kept, also where there was nothing when the run began
+KEPT = ["path", "numpy's type", "torch's type", "device", "missing lists", "counted", "array", "tensor", "parameter"]
+KEPT += ["tensor with a gradient", "red", "path keys", "a large integer", "complex", "surrogates", "other generator"]
+KEPT += ["structured", "objects in an array", "cyclic", "int", "long integers", "long unsigned", "float32", "range"]
+KEPT_IN_PLACE = [*KEPT, "module", "optimizer", "views", "counter", "a default", "method", "partial", "enum keys"]
+KEPT_IN_PLACE += ["record", "names", "mean", "numpy", "missing counters", "spawned", "tensor and array", "a lambda"]
+
+
+@pytest.mark.parametrize("leaf", KEPT)
+def test_what_is_made_from_its_content_alone_is_kept(model, leaf):
+    now, restored, named = there_and_back(model, ("None", ("list", [])), (leaf, ("list", [leaf, leaf])))
+    assert (alike(now, restored), named) == (True, [])
+
+
+@pytest.mark.parametrize("leaf", KEPT_IN_PLACE)
+def test_what_was_there_when_training_began_is_kept(model, leaf):
+    now, restored, named = there_and_back(model, (leaf, "None"), (leaf, "None"))
+    assert (alike(now, restored), named) == (True, [])
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("other path", "path"), ("array", "other array"), ("counter", "other counter"), ("partial", "other partial"),
+        ("a default", "another default"), (("list", ["red"]), ("list", ["blue", "red"])),
+        (("node", ["array"]), ("node", ["other array"])), (("dict", ["record"]), ("dict", ["record"])),
+    ],
+)  # fmt: skip
+def test_what_changes_is_kept(model, before, after):
+    now, restored, named = there_and_back(model, (before, "None"), (after, "None"))
+    assert (alike(now, restored), named) == (True, [])
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (("list", []), ("list", ["record"])), ("None", ("node", [])), ("a lambda", "another lambda"),
+        ("len", "max"), ("numpy", "torch"), ("add", "multiply"), ("list of int", "list of str"),
+        ("method", "other method"), ("views", "no views"), ("no views", "views"), ("views", "shifted views"),
+        ("None", "lock"), ("None", "deep"), ("None", "nan as a key"),
+        (("list", ["record", ("same", 0)]), ("list", ["record"] * 2)),
+    ],
+)  # fmt: skip
+def test_what_will_not_come_back_is_named(model, before, after):
+    _, _, named = there_and_back(model, (before, "None"), (after, "None"))
+    if (before, after) != ("views", "no views"):  # three arrays, each its own again
+        assert len(named) >= 1
+        assert all(why.startswith("callbacks.callbacks[0].x") for why in named)
+
+
+# ---------------------------------------------------------------- in a run
+
+
+class Grows(BaseCallback):
+    """What it holds can be captured when training begins, and not from step 30 on."""
+
+    def __init__(self):
+        super().__init__()
+        self.notes, self.lock, self.count = [], None, 0
+
+    def _on_step(self):
+        self.count += 1
+        if self.num_timesteps == 30:
+            self.notes.append(Node(1))
+            self.lock = threading.Lock()
+        return True
+
+
+def run(folder, callback, stop_at=None, env=None):
+    model = make_model() if env is None else make_model_on(env)
+    states = ResumeStates(folder, freq=20, verbose=0)
+    try:
+        states.select(model)
+        model.learn(100, callback=[states, callback, StopAt(stop_at)])
+    except Stop:
+        pass
+    finally:
+        states.store.close()
+    return states, model
+
+
+def test_what_cannot_be_captured_any_more_is_named_once_and_ends_nothing(tmp_path):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run(tmp_path, Grows(), stop_at=90)
+    named = [str(warning.message) for warning in caught if "Not in the resume states" in str(warning.message)]
+    where = "Not in the resume states: callbacks.callbacks[1]"
+    assert named == [
+        f"{where}.notes[0] is a tests.helpers.values.Node, which was not there when training began",
+        f"{where}.lock is a _thread.lock",
+    ]
+    grows = Grows()
+    run(tmp_path, grows)
+    assert (grows.count, grows.notes, grows.lock) == (100, [], None)  # as built, but for what can be captured
+
+
+def test_a_usual_run_has_nothing_to_name_and_verifies_in_no_time(tmp_path):
+    """Its files are left alone: they are not restored when training begins."""
+    model = SAC("MlpPolicy", "HalfCheetah-v5", seed=1, device="cpu", learning_starts=10, buffer_size=200_000)
+    states = ResumeStates(tmp_path, freq=20, verbose=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(50, callback=states)
+        start = time.perf_counter()
+        assert states.verify(model) == []
+        assert time.perf_counter() - start < 0.5
+    states.store.close()
+
+
+def test_verify_can_be_called_before_training(tmp_path):
+    model = make_model()
+    model.lock = threading.Lock()
+    states = ResumeStates(tmp_path, verbose=0)
+    assert states.verify(model) == ["model.lock is a _thread.lock"]
+    states.store.close()
+
+
+def test_verify_compares_without_the_code_that_restores(model, monkeypatch):
+    """A kind whose restoring is broken is noticed, whatever it is."""
+    holds = Holds(bytearray(b"ab"), [1, 2])
+    monkeypatch.setattr(KINDS["bytearray"], "restore", lambda context, content, existing, path: existing + b"c")
+    names, _ = state.verify(model, CallbackList([holds]))
+    assert "callbacks.callbacks[0].x does not come back as it was" in names
+    assert not any(name.startswith("callbacks.callbacks[0].y") for name in names)
+
+
+class Draws(Still):
+    """An environment whose restore fails: its object is of another class in the second process."""
+
+    kind = Node
+
+    def __init__(self):
+        self.part, self.drawn = self.kind(), []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 1).astype(np.float32), {}
+
+    def step(self, action):
+        self.drawn.append(self.np_random.uniform())
+        return np.zeros(1, np.float32), self.drawn[-1], False, False, {}
+
+
+def make_model_on(env):
+    small = {"policy_kwargs": {"net_arch": [2]}, "buffer_size": 200, "learning_starts": 100, "device": "cpu"}
+    return SAC("MlpPolicy", env, seed=1, **small)
+
+
+def test_an_environment_whose_restore_fails_does_not_repeat_its_draws(tmp_path, monkeypatch):
+    first = Draws()
+    run(tmp_path, Holds(1, 2), stop_at=45, env=first)
+    monkeypatch.setattr(Draws, "kind", type("Other", (Node,), {}))
+    second = Draws()
+    with pytest.warns(RuntimeWarning, match=r"with new episodes.*part was a .*Node, and is a .*Other"):
+        run(tmp_path, Holds(1, 2), env=second)
+    assert not set(first.drawn[:40]) & set(second.drawn[-60:])
+
+
+def test_an_attribute_whose_restore_fails_stays_as_built_and_the_others_do_not(tmp_path):
+    run(tmp_path, Holds(Node([1]), 5), stop_at=45)
+    holds = Holds([7], 6)
+    with pytest.warns(
+        RuntimeWarning, match=r"Not restored: callbacks\.callbacks\[1\]\.x was a .*Node, and is a .*list"
+    ):
+        run(tmp_path, holds)
+    assert (holds.x, holds.y) == ([7], 5)
+
+
+def test_a_path_in_the_folder_moves_with_it_and_others_stay(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    paths = [Path("run/notes.txt"), tmp_path / "run" / "notes.txt", Path("other/notes.txt")]
+    run(Path("run/states"), Holds(paths, None), stop_at=45)
+    (tmp_path / "run").rename(tmp_path / "moved")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    holds = Holds([], None)
+    run(Path("../moved/states"), holds)
+    assert holds.x == [Path("../moved/notes.txt"), Path("../moved/notes.txt"), Path("other/notes.txt")]
+
+
+@pytest.mark.parametrize(
+    ("one", "apart"),
+    [
+        ("array", "other array"),
+        ("generator", "other generator"),
+        ("missing lists", ("list", [])),
+        ("tensor", "parameter"),
+    ],
+)
+def test_what_was_one_and_is_two_now_does_not_become_one_again(model, one, apart):
+    now, restored, named = there_and_back(model, (one, ("same", 0)), (one, apart))
+    assert (alike(now, restored), named) == (True, [])
+
+
+def test_arrays_that_no_longer_share_their_memory_do_not_write_into_each_other(model):
+    before, after = ("views", "None"), ("other arrays of these shapes", "None")
+    now, restored, named = there_and_back(model, before, after)
+    assert (alike(now, restored), named) == (True, [])
