@@ -12,15 +12,19 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
 
 from sb3_tdc.common.checks import check_action_space, check_integer, check_number
+from sb3_tdc.common.dormant import dormant_share, relu_activations
+from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
 from sb3_tdc.common.versions import numba_version
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
+from sb3_tdc.tdc.lam import describe_selection
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -33,6 +37,8 @@ SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
 # The critics' diagnostics (docs/tdc.md) are taken at every fiftieth update: at every one they would slow it down
 DIAGNOSTICS_INTERVAL = 50
+# Dormant units (docs/tdc.md) need forward passes, and change slowly
+UNITS_INTERVAL = 500
 
 # Where the gradient stays zero (dead ReLUs), Adam's moments decay into denormal numbers and never leave them: 0.9 times
 # the smallest one is rounded to itself. Intel's processors compute with them many times slower. Next to ε they are 0
@@ -353,6 +359,8 @@ class TDC(CheckedOffPolicyAlgorithm):
         if self._n_updates % self.policy_delay == 0:
             self.update_actor(replay_data)
             self.update_targets()
+        if self.diagnoses_units:
+            self.diagnose_units(replay_data)
 
     def _flush_moments(self) -> None:
         """Set moments of Adam to zero that are about to become denormal numbers."""
@@ -487,6 +495,19 @@ class TDC(CheckedOffPolicyAlgorithm):
         """Return whether this is an update at which the critics' diagnostics are taken."""
         return self._n_updates % DIAGNOSTICS_INTERVAL == 1
 
+    @property
+    def diagnoses_units(self) -> bool:
+        """Whether this is an update after which dormant units are counted."""
+        return self._n_updates % UNITS_INTERVAL == 0
+
+    @property
+    def _has_plain_units(self) -> bool:
+        """Whether the networks are linear layers and ReLUs on flat observations: a forward pass changes nothing."""
+        kinds = (nn.Linear, StackedLinear, nn.ReLU, nn.Tanh, nn.Flatten, nn.Sequential, nn.ModuleList, FlattenExtractor)
+        modules = [module for network in (self.actor, self.critic) for module in network.modules()]
+        inner = [module for module in modules if module not in (self.actor, self.critic)]
+        return all(type(module) in kinds for module in inner) and isinstance(self.observation_space, spaces.Box)
+
     def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
         """
         Take the diagnostics of the critics into the log; each is described in docs/tdc.md.
@@ -503,7 +524,24 @@ class TDC(CheckedOffPolicyAlgorithm):
             critic_disagreement=(mean.amax(dim=1) - mean.amin(dim=1)).mean(),
             td_error_var=td_errors.var(dim=0, correction=0).mean(),
             **{f"critic_{i + 1}_selected": (selected == i).float().mean() for i in range(mean.shape[1])},
+            **describe_selection(target),
         )
+
+    def diagnose_units(self, replay_data: ReplayBufferSamples) -> None:
+        """
+        Take the shares of dormant units into the log: of the actor, and of the critics at its mean actions.
+
+        :param replay_data: a minibatch, whose observations count
+        """
+        if not self._has_plain_units:
+            return
+        hidden = self.actor.latent_pi if self.stochastic_actor else self.actor.mu
+        observations = replay_data.observations.float().flatten(1)
+        of_actor, outputs = relu_activations(hidden, observations)  # type: ignore[arg-type]
+        actions = self.actor.mu(outputs).tanh() if self.stochastic_actor else outputs  # type: ignore[operator]
+        of_critics, _ = relu_activations(self.critic.layers, th.cat([observations, actions.detach()], dim=1))
+        if of_actor and of_critics:
+            self.diagnose(actor_dormant=dormant_share(of_actor), critic_dormant=dormant_share(of_critics))
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

@@ -137,6 +137,8 @@ class FusedUpdate:
         if model._n_updates % model.policy_delay == 0:
             self.update_actor()
             self.update_targets()
+        if model.diagnoses_units:
+            model.diagnose_units(replay_data)
 
     def sample(self) -> ReplayBufferSamples:
         """Return a minibatch of the model's replay buffer; of a packed one, the next overwrites it."""
