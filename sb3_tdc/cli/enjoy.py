@@ -17,8 +17,9 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_tdc.advb.policies import AdvisedPolicy
 from sb3_tdc.cli.arguments import Parser, add_settings
 from sb3_tdc.common.files import check_writable
+from sb3_tdc.common.returns import steps_until_negligible
 from sb3_tdc.common.threads import set_threads
-from sb3_tdc.critics.episodes import record_episodes, steps_until_negligible
+from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
 from sb3_tdc.envs.make import import_packages, split_env_id
 from sb3_tdc.envs.rendering import (

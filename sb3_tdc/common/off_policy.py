@@ -48,7 +48,8 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
             setattr(self, name, check_integer(name, getattr(self, name), minima.get(name, 1)))
         for name in self.schedules:
             value = self.scheduled(name, progress_remaining=1.0)
-            if getattr(self, name) is not None and not callable(getattr(self, name)):
+            given = getattr(self, name)
+            if given is not None and not callable(given) and not isinstance(given, str):
                 setattr(self, name, value)
         self._convert_train_freq()
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from sb3_tdc.common.plots import import_figure, style_axes
-from sb3_tdc.critics.episodes import TOLERANCE, Episode, summarise
+from sb3_tdc.common.returns import TOLERANCE
+from sb3_tdc.critics.episodes import Episode, summarise
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import quantile_midpoints
 

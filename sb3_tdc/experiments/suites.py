@@ -72,4 +72,10 @@ EVIDENCE: dict[str, list[Cell]] = {
         ("tdc", {"learning_rate": 3e-4, "qf_learning_rate": 3e-4}),
     ),
 }
-SUITES = {**PAPER, **EVIDENCE}
+# What λ does, and whether it should tune itself
+LAMBDA: dict[str, list[Cell]] = {
+    "lambda": _shorter(
+        100_000, ("Hopper-v4", "HalfCheetah-v4"), *(("tdc", {"lam": lam}) for lam in (0.0, 0.5, 1.0, "auto"))
+    )
+}
+SUITES = {**PAPER, **EVIDENCE, **LAMBDA}

@@ -1,7 +1,9 @@
 """TDC-λ as a Stable-Baselines3 algorithm. ``train()`` follows Algorithm 1 of the paper, phase by phase."""
 
+import copy
 import io
 import pathlib
+import re
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
@@ -10,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -24,7 +27,7 @@ from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
 from sb3_tdc.common.versions import numba_version
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
-from sb3_tdc.tdc.lam import describe_selection
+from sb3_tdc.tdc.lam import PendingEpisode, calibrate, describe_selection, initial_lam
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -43,6 +46,12 @@ UNITS_INTERVAL = 500
 # Where the gradient stays zero (dead ReLUs), Adam's moments decay into denormal numbers and never leave them: 0.9 times
 # the smallest one is rounded to itself. Intel's processors compute with them many times slower. Next to ε they are 0
 FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
+
+
+def _lam_field(name: str, value: Any) -> Any:
+    """Take a number, a schedule, or how to calibrate λ."""
+    is_text = isinstance(value, str) and re.fullmatch(r"auto(_[0-9.e-]{1,20})?", value)
+    return value if is_text else schedule(name, value)
 
 
 class TDC(CheckedOffPolicyAlgorithm):
@@ -71,7 +80,8 @@ class TDC(CheckedOffPolicyAlgorithm):
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
     :param n_steps: n-step returns if > 1 (with the ``NStepReplayBuffer``)
     :param lam: λ ≥ 0, the weight of the spread in the selection of the target critic (Eq. 5), or a schedule. λ only
-        selects; 0 takes the smaller mean (TD3's clipped double), and a larger λ never gives a smaller target mean
+        selects; 0 takes the smaller mean (TD3's clipped double), and a larger λ never gives a smaller target mean.
+        ``"auto"`` calibrates it on finished episodes (see docs/tdc.md), ``"auto_0.5"`` from 0.5 on
     :param stochastic_actor: ζ: a tanh-Gaussian head trained with entropy (True), or a deterministic one (False).
         Exploration and evaluation use the mean action with both
     :param qf_learning_rate: η_Q, learning rate of the critics, or a schedule; None: as ``learning_rate``
@@ -103,7 +113,9 @@ class TDC(CheckedOffPolicyAlgorithm):
     }
     schedules: ClassVar[tuple[str, ...]] = ("lam", "learning_rate", "qf_learning_rate")
     saved_fields: ClassVar[dict[str, SavedField]] = {
-        "lam": SavedField(schedule),
+        "lam": SavedField(_lam_field),
+        "_lam_value": SavedField(or_none(number(0.0)), is_required=False),
+        "_lam_scale": SavedField(number(0.0), is_required=False),
         "kappa": SavedField(number(0.0)),
         "qf_learning_rate": SavedField(or_none(schedule)),
         "stochastic_actor": SavedField(boolean),
@@ -123,6 +135,7 @@ class TDC(CheckedOffPolicyAlgorithm):
     changeable: ClassVar[tuple[str, ...]] = (
         *("lam", "kappa", "qf_learning_rate", "policy_delay", "target_policy_noise", "target_noise_clip"),
     )
+    captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics", "_episodes_under_way")
     color: ClassVar[str | None] = "#0072B2"
     policy: TDCPolicy
     replay_buffer: ReplayBuffer
@@ -144,7 +157,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        lam: float | Schedule = 1.0,
+        lam: float | Schedule | str = 1.0,
         stochastic_actor: bool = False,
         qf_learning_rate: float | Schedule | None = None,
         kappa: float = 1.0,
@@ -205,6 +218,9 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.ent_coef_optimizer: Any = None
         self.ent_coef_tensor: Any = None
         self.fused = fused
+        # Of a calibrated λ: where it is, None where it begins; the moving average of |G − Q₁|
+        self._lam_value: float | None = None
+        self._lam_scale = 0.0
 
         if _init_setup_model:
             self._setup_model()
@@ -216,6 +232,8 @@ class TDC(CheckedOffPolicyAlgorithm):
         for name in ("kappa", "target_policy_noise", "target_noise_clip"):
             setattr(self, name, check_number(name, getattr(self, name), 0.0))
         self.policy_delay = check_integer("policy_delay", self.policy_delay, 1)
+        if isinstance(self.lam, str):
+            initial_lam(self.lam)
         for name in ("n_quantiles", "n_critics"):
             check_integer(f"policy_kwargs[{name!r}]", self.policy_kwargs.get(name, 1), 1)
         if self.target_entropy != "auto":
@@ -248,6 +266,8 @@ class TDC(CheckedOffPolicyAlgorithm):
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
         if name == "qf_learning_rate" and self.qf_learning_rate is None:
             name = "learning_rate"
+        if name == "lam" and isinstance(self.lam, str):
+            return initial_lam(self.lam) if self._lam_value is None else self._lam_value
         return super().scheduled(name, progress_remaining)
 
     def _setup_model(self) -> None:
@@ -263,6 +283,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         self._setup_fused_update()
         self._setup_temperature()
+        self._episodes_under_way: list[PendingEpisode] = []
 
     @property
     def action_noise(self) -> ActionNoise | None:
@@ -570,6 +591,59 @@ class TDC(CheckedOffPolicyAlgorithm):
     ) -> SelfTDC:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
 
+    # ---------------------------------------------------------------- λ by calibration
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        before = self._last_obs
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self._last_obs is not before:  # the environments were reset
+            self._episodes_under_way = [PendingEpisode() for _ in range(self.n_envs)]
+        return prepared
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if isinstance(self.lam, str):
+            self._follow_episodes(buffer_action, reward, dones, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _follow_episodes(
+        self, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        """Add a step of every environment to its episode, and calibrate λ on those that end."""
+        normalization = self._vec_normalize_env
+        rewards = reward if normalization is None else normalization.get_original_reward()
+        observations: Any = self._last_obs
+        for i, episode in enumerate(self._episodes_under_way):
+            one = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
+            episode.add(copy.deepcopy(one), action[i].copy(), float(rewards[i]))
+            if dones[i]:
+                self._calibrate_lam(episode, not infos[i].get("TimeLimit.truncated", False))
+                self._episodes_under_way[i] = PendingEpisode()
+
+    def _calibrate_lam(self, episode: PendingEpisode, terminated: bool) -> None:
+        rewards: Any = episode.rewards
+        if self._vec_normalize_env is not None:  # as the critics learn them
+            rewards = self._vec_normalize_env.normalize_reward(np.asarray(rewards))
+        returns, n_steps = episode.finish(rewards, terminated, self.gamma)
+        if n_steps == 0 or self._n_updates == 0:
+            return
+        some = episode.observations[: len(returns)]
+        stacked = {k: np.stack([o[k] for o in some]) for k in some[0]} if isinstance(some[0], dict) else np.stack(some)
+        self.policy.set_training_mode(False)
+        with th.no_grad():
+            actions = th.as_tensor(np.stack(episode.actions[: len(returns)]), device=self.device).float().flatten(1)
+            values = self.critic.q1_forward(self.policy.obs_to_tensor(stacked)[0], actions)  # type: ignore[arg-type]
+        errors = returns - values.squeeze(1).cpu().numpy()
+        self._lam_value, self._lam_scale = calibrate(self.scheduled("lam"), self._lam_scale, errors, n_steps)
+        self.diagnose(lam_error=th.as_tensor(errors.mean()), lam_scale=th.as_tensor(self._lam_scale))
+
     # ---------------------------------------------------------------- saving
 
     @classmethod
@@ -614,7 +688,7 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_fused_update", "_built_ent_coef"]
+        derived = ["_obstacles", "_fused_update", "_built_ent_coef", "_episodes_under_way"]
         return [*super()._excluded_save_params(), *networks, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

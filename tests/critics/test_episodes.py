@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import enjoy, train
+from sb3_tdc.common import returns
 from sb3_tdc.critics import episodes as explain
 from sb3_tdc.critics import figures
 from sb3_tdc.runs.callbacks import critic_evaluation
@@ -51,23 +52,23 @@ def make_model(env, **kwargs):
 
 def test_discounted_returns_by_hand():
     # G_2 = 4, G_1 = 2 + 0.5·4 = 4, G_0 = 1 + 0.5·4 = 3
-    assert explain.discounted_returns(np.array([1.0, 2.0, 4.0]), 0.5).tolist() == [3, 4, 4]
+    assert returns.discounted_returns(np.array([1.0, 2.0, 4.0]), 0.5).tolist() == [3, 4, 4]
 
 
 @given(REWARDS, st.floats(0, 1))
 def test_discounted_returns_are_the_sums(rewards, gamma):
     sums = [sum(gamma**i * r for i, r in enumerate(rewards[step:])) for step in range(len(rewards))]
-    np.testing.assert_allclose(explain.discounted_returns(np.array(rewards), gamma), sums, atol=1e-6)
+    np.testing.assert_allclose(returns.discounted_returns(np.array(rewards), gamma), sums, atol=1e-6)
 
 
 def test_a_truncated_episode_is_known_where_its_tail_weighs_nothing():
     # 0.5^7 = 0.0078 is the first power of at most 0.01: the last 6 of 10 steps have an unseen tail that weighs more
-    assert explain.steps_until_negligible(0.5) == 7
-    assert explain.known_steps(10, terminated=False, gamma=0.5) == 3
-    assert explain.known_steps(5, terminated=False, gamma=0.5) == 0
-    assert explain.known_steps(10, terminated=True, gamma=0.5) == 10
-    assert explain.known_steps(10, terminated=False, gamma=1.0) == 0
-    assert explain.known_steps(10, terminated=False, gamma=0.0) == 9
+    assert returns.steps_until_negligible(0.5) == 7
+    assert returns.known_steps(10, terminated=False, gamma=0.5) == 3
+    assert returns.known_steps(5, terminated=False, gamma=0.5) == 0
+    assert returns.known_steps(10, terminated=True, gamma=0.5) == 10
+    assert returns.known_steps(10, terminated=False, gamma=1.0) == 0
+    assert returns.known_steps(10, terminated=False, gamma=0.0) == 9
 
 
 def test_observed_frequency_by_hand():
@@ -135,7 +136,7 @@ def test_play_records_what_the_critics_say_about_the_action_that_is_played():
 
 
 def test_play_goes_on_behind_the_time_limit_and_shows_what_lies_before():
-    horizon = explain.steps_until_negligible(0.9)  # 44
+    horizon = returns.steps_until_negligible(0.9)  # 44
     env = make_env(length=10_000, limit=20 + horizon)
     episodes = explain.record_episodes(make_model(env), env, 2, limit=20)
     for episode in episodes:

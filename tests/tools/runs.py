@@ -142,6 +142,7 @@ OTHERS = {
     ),
     "AdvB-TD3": Case("Hopper-v4", AdvBTD3, kwargs={"formation_period": 3}),
     "AdvB-SAC": Case("Hopper-v4", AdvBSAC, n_envs=2, wrap=VecNormalize),
+    "calibrated λ": Case("Hopper-v4", n_envs=2, kwargs={"lam": "auto_0.5", "gamma": 0.9}),
     "AdvB-TDC": Case("Hopper-v4", AdvBTDC, kwargs={"formation_period": 2, "lam": LinearSchedule(1.0, 0, 1)}),
     "SAC, gSDE": Case("Hopper-v4", SAC, n_envs=2, kwargs={"use_sde": True, "sde_sample_freq": 4}),
     "TQC, gSDE": Case("Hopper-v4", TQC, kwargs={"use_sde": True}),
