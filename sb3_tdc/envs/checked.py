@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial, wraps
+from multiprocessing.connection import wait
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -218,8 +219,7 @@ class CheckedSubprocVecEnv(SubprocVecEnv):
             super().__init__([partial(_make_reporting, env_fn) for env_fn in env_fns], start_method)
         except (EOFError, ConnectionError) as error:
             self._watch()
-            dead = next((remote for remote in self.remotes if not remote.process.is_alive()), self.remotes[0])
-            sentence = dead.describe_death()
+            sentence = self._find_dead().describe_death()
             self._kill()
             raise EnvironmentFaultError(sentence) from error
         self._watch()
@@ -228,6 +228,12 @@ class CheckedSubprocVecEnv(SubprocVecEnv):
         except EnvironmentFaultError:
             self._kill()
             raise
+
+    def _find_dead(self) -> "_Remote":
+        """Return the remote of a process that has ended, which may take a moment to show."""
+        ends = {remote.process.sentinel: remote for remote in self.remotes}
+        ended = wait(list(ends), _SECONDS_TO_DIE)
+        return ends[ended[0]] if ended else self.remotes[0]
 
     def _watch(self) -> None:
         pairs = zip(self.remotes, self.processes, strict=True)
