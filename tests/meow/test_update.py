@@ -70,6 +70,7 @@ def flatten(weights):
 def test_one_gradient_step_is_that_of_the_transcription(max_grad_norm):
     model = make_model(max_grad_norm=max_grad_norm, ent_coef=0.3, gamma=0.9, tau=0.1, learning_rate=1e-3)
     batch = next(random_batches(1))
+    batch[3][0] = 1  # an episode that ended
     weights, target = weights_of(model.network), weights_of(model.network_target)
     before = [tensor.clone() for tensor in flatten(target)]
     parameters = [parameter.requires_grad_(True) for parameter in flatten(weights)]
@@ -92,6 +93,7 @@ def test_one_gradient_step_is_that_of_the_transcription(max_grad_norm):
 def test_logged_values_are_those_of_the_equations():
     model = make_model(ent_coef=0.3, learning_rate=0.0, tau=0.0)
     batch = next(random_batches(1))
+    batch[3][0] = 1  # an episode that ended
     weights, target = weights_of(model.network), weights_of(model.network_target)
     train(model, [batch])
     obs, actions, next_obs, dones, rewards = (part.double() for part in batch)

@@ -1,0 +1,206 @@
+"""Gymnasium's vector environments against SB3's ``DummyVecEnv``, transition by transition."""
+
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from sb3_tdc import TDC
+from sb3_tdc.envs.vector import GymnasiumVecEnv, split_infos
+
+MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED]
+
+
+class Counts(gym.Env):
+    """Counts its steps; ends by itself, or by its time, after lengths that it was given."""
+
+    observation_space = gym.spaces.Dict(
+        {"step": gym.spaces.Box(0, 100, (1,), np.float32), "episode": gym.spaces.Box(0, 100, (1,), np.float32)}
+    )
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, lengths):
+        self.lengths, self.episode = lengths, -1
+
+    def _observe(self):
+        return {"step": np.float32([self.t]), "episode": np.float32([self.episode])}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.episode = 0, self.episode + 1
+        return self._observe(), {"began": self.episode}
+
+    def step(self, action):
+        self.t += 1
+        over = self.t == self.lengths[self.episode % len(self.lengths)]
+        by_time = over and self.episode % 2 == 1
+        info = {"t": self.t, "nested": {"double": 2.0 * self.t}, "name": f"step {self.t}"}
+        return self._observe(), float(action[0]), over and not by_time, by_time, info
+
+
+def alike(one, other):
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            alike(one[key], other[key])
+    elif isinstance(one, str):
+        assert one == other
+    else:
+        np.testing.assert_array_equal(np.asarray(one, dtype=float), np.asarray(other, dtype=float))
+
+
+def compare(functions, vector, n_steps, action_space, seed=3):
+    """Step both with the same actions."""
+    expected, found = DummyVecEnv(functions), GymnasiumVecEnv(vector)
+    for env in (expected, found):
+        env.seed(seed)
+    alike(expected.reset(), found.reset())
+    alike(expected.reset_infos[0], found.reset_infos[0])
+    rng = np.random.default_rng(0)
+    n_ended = 0
+    for _ in range(n_steps):
+        actions = rng.uniform(action_space.low, action_space.high, (len(functions), *action_space.shape))
+        results = [env.step(actions.astype(np.float32)) for env in (expected, found)]
+        (obs, rewards, dones, infos), (obs_, rewards_, dones_, infos_) = results
+        alike(obs, obs_)
+        np.testing.assert_array_equal(rewards, rewards_)
+        np.testing.assert_array_equal(dones, dones_)
+        for i, (info, info_) in enumerate(zip(infos, infos_, strict=True)):
+            if not dones[i]:
+                info = {k: v for k, v in info.items() if k != "TimeLimit.truncated"}
+            alike(info, info_)
+            if dones[i]:
+                n_ended += 1
+                alike(expected.reset_infos[i], found.reset_infos[i])
+    found.close()
+    return n_ended
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("env_id", ["Hopper-v4", "Pendulum-v1"])
+def test_it_is_the_dummy_on_real_tasks(env_id, mode):
+    functions = [lambda: gym.make(env_id, max_episode_steps=50)] * 3
+    space = functions[0]().action_space
+    assert compare(functions, SyncVectorEnv(functions, autoreset_mode=mode), 160, space) >= 9
+
+
+@pytest.mark.parametrize("mode", MODES)
+@settings(max_examples=30, deadline=None)
+@given(lengths=st.lists(st.lists(st.integers(1, 5), min_size=1, max_size=3), min_size=1, max_size=4))
+def test_it_is_the_dummy_whatever_ends_when(mode, lengths):
+    functions = [lambda each=each: Counts(each) for each in lengths]
+    assert compare(functions, SyncVectorEnv(functions, autoreset_mode=mode), 14, Counts.action_space) > 0
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_processes_too(mode):
+    functions = [lambda: Counts([3, 4]), lambda: Counts([2])]
+    assert compare(functions, AsyncVectorEnv(functions, autoreset_mode=mode), 12, Counts.action_space) > 4
+
+
+def test_processes_that_would_reset_twice_are_refused():
+    functions = [lambda: Counts([3, 4]), lambda: Counts([2])]
+    vector = AsyncVectorEnv(functions, shared_memory=False)
+    with pytest.raises(ValueError, match=r"resets twice: .*SAME_STEP"):
+        GymnasiumVecEnv(vector)
+    vector.close()
+    vector = AsyncVectorEnv(functions, shared_memory=False, autoreset_mode=AutoresetMode.SAME_STEP)
+    assert compare(functions, vector, 12, Counts.action_space) > 4
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_no_transition_crosses_episodes(mode):
+    """A step that only resets would be one with reward 0 from the last observation to the first."""
+    env = VecMonitor(GymnasiumVecEnv(SyncVectorEnv([lambda: Counts([3])] * 2, autoreset_mode=mode)))
+    model = TDC("MultiInputPolicy", env, learning_starts=1000, buffer_size=200, seed=0, device="cpu").learn(60)
+    buffer = model.replay_buffer
+    now, then = buffer.observations, buffer.next_observations
+    filled = slice(0, buffer.pos)
+    np.testing.assert_array_equal(now["episode"][filled], then["episode"][filled])
+    np.testing.assert_array_equal(now["step"][filled] + 1, then["step"][filled])
+    assert (buffer.timeouts[filled].sum(), buffer.dones[filled].sum()) == (10, 20)  # every second ends by its time
+    assert [info["l"] for info in model.ep_info_buffer] == [3] * 20
+
+
+class Tensors(VectorEnv):
+    """A simulator on tensors that resets in the step that ends an episode, without attributes for its environments."""
+
+    metadata: ClassVar[dict] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    render_mode = None
+
+    def __init__(self, num_envs=4):
+        self.num_envs = num_envs
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        self.t = th.arange(self.num_envs)
+        return self._observe(), {}
+
+    def _observe(self):
+        return th.stack([self.t, self.t], dim=1).float()
+
+    def step(self, actions):
+        self.t = self.t + 1
+        over, last = self.t >= 6, self._observe()
+        self.t = th.where(over, 0, self.t)
+        infos = {"final_obs": last, "_final_obs": over} if over.any() else {}
+        return self._observe(), th.ones(self.num_envs), th.zeros(self.num_envs, dtype=th.bool), over, infos
+
+
+def test_tensors_become_arrays():
+    env = GymnasiumVecEnv(Tensors())
+    assert env.reset().tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
+    for _ in range(3):
+        observations, rewards, dones, infos = env.step(np.zeros((4, 1), np.float32))
+    assert (observations.dtype, rewards.dtype, dones.tolist()) == (np.float32, np.float32, [False, False, False, True])
+    assert observations[3].tolist() == [0, 0]
+    assert infos[3]["terminal_observation"].tolist() == [6, 6]
+    assert infos[3]["TimeLimit.truncated"] is True
+    assert infos[0] == {}
+    TDC("MlpPolicy", env, learning_starts=20, batch_size=8, device="cpu").learn(60)
+
+
+def test_attributes_and_methods():
+    env = GymnasiumVecEnv(SyncVectorEnv([lambda: Counts([3]), lambda: Counts([4])]))
+    assert env.get_attr("lengths") == [[3], [4]]
+    assert env.get_attr("lengths", 1) == [[4]]
+    env.reset()
+    env.set_attr("episode", 7)
+    assert env.get_attr("episode") == [7, 7]
+    assert [step["step"].tolist() for step in env.env_method("_observe")] == [[0], [0]]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
+    for call in (lambda: env.set_attr("episode", 1, indices=0), lambda: env.env_method("_observe", indices=[1])):
+        with pytest.raises(ValueError, match="for all environments at once"):
+            call()
+    tensors = GymnasiumVecEnv(Tensors())
+    with pytest.raises(AttributeError, match="cannot set attributes"):
+        tensors.set_attr("gravity", 1)
+    with pytest.raises(AttributeError, match="cannot call methods"):
+        tensors.env_method("jump")
+
+
+class ResetsAll(SyncVectorEnv):
+    """Does not know ``reset_mask``, as with Gymnasium 1.0."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)
+
+
+def test_an_environment_that_resets_all_or_none_is_refused():
+    env = GymnasiumVecEnv(ResetsAll([lambda: Counts([2]), lambda: Counts([9])]))
+    env.reset()
+    env.step(np.zeros((2, 1), np.float32))
+    with pytest.raises(ValueError, match=r"cannot reset single environments .*SAME_STEP"):
+        env.step(np.zeros((2, 1), np.float32))
+
+
+def test_infos_are_split_by_hand():
+    infos = {"a": np.array([1, 2]), "_a": np.array([True, False]), "b": {"c": np.array([3.0, 4.0])}, "_own": "xy"}
+    assert split_infos(infos, 2) == [{"a": 1, "b": {"c": 3}, "_own": "x"}, {"b": {"c": 4}, "_own": "y"}]
