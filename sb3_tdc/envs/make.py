@@ -9,11 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_tdc.envs.checked import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
 from sb3_tdc.envs.mujoco import print_warnings_once
 from sb3_tdc.envs.processes import ignore_signals
+from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.resume import Restorable
 from sb3_tdc.safe_load import load_normalization
@@ -80,23 +81,15 @@ def make_envs(
     Make the environments of a run, wrapped as its hyperparameters say.
 
     :param env_kwargs: of the environment's constructor, over those of the hyperparameters
-    :param vec_env: "dummy" (one process) or "subproc"
+    :param vec_env: "dummy" (one process), "subproc", or "gymnasium" (what ``gymnasium.make_vec`` makes)
     :param monitor_folder: for ``*.monitor.csv``
     :param normalization: saved statistics for ``VecNormalize``
     :param training: False: statistics stay as they are and rewards are not normalised
     :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
     """
-    is_subproc = vec_env == "subproc"
-    env = make_vec_env(
-        _maker(env_id, hyperparams, ignores_signals=is_subproc),
-        n_envs=n_envs,
-        seed=seed,
-        monitor_dir=str(monitor_folder) if monitor_folder else None,
-        monitor_kwargs=hyperparams.monitor_kwargs,
-        env_kwargs={**hyperparams.env_kwargs, **(env_kwargs or {})},
-        vec_env_cls=CheckedSubprocVecEnv if is_subproc else DummyVecEnv,
-        wrapper_class=Restorable if is_subproc else None,
-    )
+    make = _make_gymnasium if vec_env == "gymnasium" else _make_sb3
+    kwargs = {**hyperparams.env_kwargs, **(env_kwargs or {})}
+    env = make(env_id, hyperparams, seed, n_envs, kwargs, monitor_folder, vec_env == "subproc")
     for wrapper in hyperparams.vec_env_wrapper:
         env = wrapper(env)
     if hyperparams.frame_stack is not None:  # before normalising: replay stores what VecNormalize was given
@@ -109,6 +102,52 @@ def make_envs(
         if not training:
             env.training, env.norm_reward = False, False
     return env
+
+
+def _make_sb3(
+    env_id: str,
+    hyperparams: Hyperparams,
+    seed: int,
+    n_envs: int,
+    env_kwargs: dict[str, Any],
+    monitor_folder: Path | None,
+    is_subproc: bool,
+) -> VecEnv:
+    return make_vec_env(
+        _maker(env_id, hyperparams, ignores_signals=is_subproc),
+        n_envs=n_envs,
+        seed=seed,
+        monitor_dir=str(monitor_folder) if monitor_folder else None,
+        monitor_kwargs=hyperparams.monitor_kwargs,
+        env_kwargs=env_kwargs,
+        vec_env_cls=CheckedSubprocVecEnv if is_subproc else DummyVecEnv,
+        wrapper_class=Restorable if is_subproc else None,
+    )
+
+
+def _make_gymnasium(
+    env_id: str,
+    hyperparams: Hyperparams,
+    seed: int,
+    n_envs: int,
+    env_kwargs: dict[str, Any],
+    monitor_folder: Path | None,
+    is_subproc: bool,
+) -> VecEnv:
+    """Make the vector environment that is registered for an id, or else single ones stepped in turn."""
+    spec = gym.spec(env_id)
+    print_warnings_once()
+    if spec.vector_entry_point is not None:
+        if hyperparams.env_wrapper:
+            raise ValueError(f"{env_id} is vectorised by itself: env_wrapper cannot wrap its single environments")
+        vector = gym.make_vec(env_id, num_envs=n_envs, **env_kwargs)
+    else:
+        single = _maker(env_id, hyperparams, ignores_signals=False)
+        vector = gym.vector.SyncVectorEnv([lambda: single(**env_kwargs)] * n_envs, autoreset_mode="SameStep")
+    env = GymnasiumVecEnv(vector)
+    env.seed(seed)
+    file = str(monitor_folder / "0") if monitor_folder is not None else None
+    return VecMonitor(env, file, tuple(hyperparams.monitor_kwargs.get("info_keywords", ())))
 
 
 def _maker(env_id: str, hyperparams: Hyperparams, ignores_signals: bool) -> Any:

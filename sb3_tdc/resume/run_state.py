@@ -82,6 +82,8 @@ def restore_state(
             f"The callbacks were {', '.join(parts['names of callbacks'])}, and are {', '.join(names)}"
         )
     _restore_values(model, callback, parts, context, changed)
+    if parts["env"] is None:  # nothing of it could be captured
+        context.restarted.append("env is not in the state")
     restarted = [why for why in context.restarted if why.startswith("env")]
     model.start_time = time.time_ns() - int(parts["seconds"] * 1e9)
     if restarted:

@@ -58,7 +58,9 @@ class RunSettings:
         default={}, role=Role.EXPERIMENT, help="key:value of the evaluation environment"
     )
     vec_env: str = setting(
-        default="dummy", choices=["dummy", "subproc"], help="environments in this process or in their own"
+        default="dummy",
+        choices=["dummy", "subproc", "gymnasium"],
+        help="environments in this process, in their own, or of gymnasium.make_vec",
     )
     hyperparams: dict[str, Any] = setting(
         "-params", "--hyperparams", default={}, role=Role.RESUMING, help="key:value over the hyperparameters"

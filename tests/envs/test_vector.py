@@ -1,5 +1,6 @@
 """Gymnasium's vector environments against SB3's ``DummyVecEnv``, transition by transition."""
 
+import threading
 from typing import ClassVar
 
 import gymnasium as gym
@@ -11,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from sb3_tdc import TDC
+from sb3_tdc import TDC, ResumeStates
+from sb3_tdc.cli import train
 from sb3_tdc.envs.vector import GymnasiumVecEnv, split_infos
 
 MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED]
@@ -204,3 +206,66 @@ def test_an_environment_that_resets_all_or_none_is_refused():
 def test_infos_are_split_by_hand():
     infos = {"a": np.array([1, 2]), "_a": np.array([True, False]), "b": {"c": np.array([3.0, 4.0])}, "_own": "xy"}
     assert split_infos(infos, 2) == [{"a": 1, "b": {"c": 3}, "_own": "x"}, {"b": {"c": 4}, "_own": "y"}]
+
+
+SMALL = ["policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16", "n_envs:3"]
+
+
+def train_on(folder, *args):
+    argv = ["--env", "Hopper-v4", "-n", "450", "--seed", "1", "--vec-env", "gymnasium", "--eval-freq", "150"]
+    argv += ["--eval-episodes", "1", "--device", "cpu", "--resume-freq", "40", "-f", folder, *args]
+    return train.main([*map(str, argv), "-params", *SMALL, "buffer_size:1000", "gradient_steps:3"])
+
+
+def test_a_training_with_it_resumes_exactly(tmp_path, monkeypatch):
+    assert train_on(tmp_path / "whole") == 0
+
+    class Killed(BaseException):
+        pass
+
+    def die_at_300(self, step):
+        if step > 300:
+            raise Killed
+        own(self, step)
+
+    own = ResumeStates._write
+    monkeypatch.setattr(ResumeStates, "_write", die_at_300)
+    with pytest.raises(Killed):
+        train_on(tmp_path / "stopped")
+    monkeypatch.undo()
+    folder = tmp_path / "stopped" / "tdc" / "Hopper-v4_1"
+    assert train.main(["--resume", str(folder)]) == 0
+    whole, resumed = (tmp_path / name / "tdc" / "Hopper-v4_1" for name in ("whole", "stopped"))
+    models = [TDC.load(path / "Hopper-v4.zip", device="cpu") for path in (whole, resumed)]
+    for one, other in zip(*(model.policy.parameters() for model in models), strict=True):
+        assert th.equal(one, other)
+    rows = [(path / "0.monitor.csv").read_text().splitlines()[2:] for path in (whole, resumed)]
+    assert [row.rpartition(",")[0] for row in rows[0]] == [row.rpartition(",")[0] for row in rows[1]]
+    assert len(rows[0]) > 10
+
+
+class Locked(Tensors):
+    """Holds what Python cannot see into."""
+
+    def __init__(self):
+        super().__init__()
+        self.lock = threading.Lock()
+
+
+def test_environments_that_cannot_be_captured_begin_new_episodes(tmp_path):
+    def learn(steps):
+        states = ResumeStates(tmp_path / "resume", freq=20)
+        model = TDC("MlpPolicy", GymnasiumVecEnv(Locked()), learning_starts=1000, buffer_size=400, seed=0, device="cpu")
+        states.select(model)
+        with pytest.warns(RuntimeWarning, match="lock") as caught:
+            model.learn(steps, callback=states)
+        states.store.close()
+        return model, " ".join(str(each.message) for each in caught)
+
+    learn(48)
+    model, said = learn(96)
+    assert "Continuing with new episodes" in said
+    buffer = model.replay_buffer
+    first = np.flatnonzero((buffer.observations[: buffer.pos, 0] == 0).all(axis=1))
+    ended = buffer.dones[first - 1, 0]  # before every first observation an episode ended, also where it was cut
+    assert ended[first > 0].all()
