@@ -31,10 +31,11 @@ class Evaluated:
     returns: np.ndarray
 
 
-def load_curve(run: RunFolder) -> Evaluated:
+def load_curve(run: RunFolder, until: int | None = None) -> Evaluated:
     """
     Read the evaluations of a run.
 
+    :param until: leave out those after this step
     :raises ValueError: if the run has no evaluations
     """
     path = run.path / "evaluations.npz"
@@ -46,7 +47,10 @@ def load_curve(run: RunFolder) -> Evaluated:
             timesteps, returns = evaluations["timesteps"], evaluations["results"]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    return Evaluated(f"{args['algo']}, seed {args['seed']}", args["env"], timesteps, returns)
+    shown = timesteps <= (np.inf if until is None else until)
+    if not shown.any():
+        raise ValueError(f"{path} has no evaluation until step {until:,}, the first is at step {timesteps[0]:,}")
+    return Evaluated(f"{args['algo']}, seed {args['seed']}", args["env"], timesteps[shown], returns[shown])
 
 
 def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
@@ -76,10 +80,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser("plot", "Draw the learning curves of runs.")
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs of one environment")
     parser.add_argument("-o", "--output", type=Path, default=Path("curve.png"), help="file (.png, .svg, .pdf)")
+    parser.add_argument("--until", type=int, metavar="STEP", help="leave out evaluations after this step")
     args = parser.parse_args(argv)
     try:
         check_writable("-o", args.output)
-        curves = [load_curve(RunFolder.open(run)) for run in args.runs]
+        curves = [load_curve(RunFolder.open(run), args.until) for run in args.runs]
         if len({curve.env_id for curve in curves}) > 1:
             raise ValueError("The runs must be of one environment; draw one figure for each")
     except ValueError as error:

@@ -29,6 +29,14 @@ def test_lines_are_means_and_dots_are_episodes(tmp_path):
     assert axes.get_ylabel() == "return of 2 mean-action episodes"
 
 
+def test_a_curve_can_be_cut(tmp_path):
+    run = RunFolder.open(make_run(tmp_path))
+    assert plot.load_curve(run, until=19).timesteps.tolist() == [10]
+    assert plot.load_curve(run, until=20).returns.tolist() == [[1, 3], [5, 9]]
+    with pytest.raises(ValueError, match="no evaluation until step 9, the first is at step 10"):
+        plot.load_curve(run, until=9)
+
+
 def test_a_figure_of_several_runs(tmp_path, capsys):
     runs = [make_run(tmp_path, seed=seed) for seed in (1, 2)]
     file = tmp_path / "figures" / "curve.png"
