@@ -153,7 +153,10 @@ def test_values_become_what_the_constructor_wants():
         ({7: 1}, "unknown key 7"),
         ({"batch_size": True}, "batch_size must be an integer, got True"),
         ({"stochastic_actor": 1}, "stochastic_actor must be true or false, got 1"),
-        ({"lam": "sometimes"}, "lam must be a number or a schedule (\"lin_\" and a number), got 'sometimes'"),
+        (
+            {"learning_rate": "sometimes"},
+            "learning_rate must be a number or a schedule (\"lin_\" and a number), got 'sometimes'",
+        ),
         ({"train_freq": [1, 2, 3]}, "train_freq must be an integer or a list of an integer, a text, got [1, 2, 3]"),
         (
             {"policy_kwargs": "dict(net_arch=range(2))"},

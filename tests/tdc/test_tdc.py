@@ -293,6 +293,8 @@ def test_what_is_logged(stochastic_actor):
     expected = {
         "actor_loss", "critic_1_selected", "critic_2_selected", "critic_disagreement", "critic_loss", "lam",
         "learning_rate", "n_updates", "qf_learning_rate", "target_mean", "target_std", "td_error_var",
+        "lam_changes", "lam_adds", "lam_adds_in_std", "lam_can_change",
+        "lam_critical_q10", "lam_critical_q50", "lam_critical_q90",
     }  # fmt: skip
     assert set(entry) == expected | ({"entropy", "ent_coef", "ent_coef_loss"} if stochastic_actor else set())
     assert (entry["lam"], entry["learning_rate"], entry["qf_learning_rate"]) == (0.3, 1e-3, 2e-3)
