@@ -3,6 +3,7 @@
 A run keeps its place below the folder, so that the matrix finds it there and does not train it again.
 """
 
+import shlex
 import shutil
 from pathlib import Path
 
@@ -50,10 +51,18 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     relative = str(place.relative_to(folder).parents[1])
     arguments = {**source.args, "log_folder": relative}
     (target / "args.yml").write_text(plain_yaml.dump(arguments))
-    (target / "command.txt").write_text(run.command.replace(str(source.args["log_folder"]), relative) + "\n")
+    command = _without_programs(run.command).replace(str(source.args["log_folder"]), relative)
+    (target / "command.txt").write_text(f"{command}\n")
     log = pd.read_csv(source.path / "progress.csv")
     _thin(log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
     return place
+
+
+def _without_programs(command: str) -> str:
+    """Return a command without the folders of the interpreter and of the script."""
+    words = shlex.split(command)
+    programs = [Path(word).name for word in words[:2]]
+    return shlex.join([*(programs[1:] if programs[1:] == ["sb3-tdc"] else programs), *words[2:]])
 
 
 def _thin(log: pd.DataFrame) -> pd.DataFrame:

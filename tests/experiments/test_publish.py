@@ -87,3 +87,16 @@ def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
     next(copy.rglob(final_episodes.FILE)).unlink()
     assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 1
     assert "Without test episodes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "published"),
+    [
+        ("/home/me/.venv/bin/python train.py --env 'a b'", "python train.py --env 'a b'"),
+        ("/home/me/.venv/bin/python /home/me/.venv/bin/sb3-tdc train -n 5", "sb3-tdc train -n 5"),
+        ("/usr/bin/python3 -m sb3_tdc train", "python3 -m sb3_tdc train"),
+        ("sb3-tdc train --algo tdc", "sb3-tdc train --algo tdc"),
+    ],
+)
+def test_commands_name_no_folders_of_programs(command, published):
+    assert publishing._without_programs(command) == published
