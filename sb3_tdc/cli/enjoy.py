@@ -21,7 +21,7 @@ from sb3_tdc.common.returns import steps_until_negligible
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
-from sb3_tdc.envs.make import import_packages, split_env_id
+from sb3_tdc.envs.registry import import_packages, split_env_id
 from sb3_tdc.envs.rendering import (
     VIDEO_SUFFIXES,
     VideoWriter,

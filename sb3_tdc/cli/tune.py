@@ -10,7 +10,7 @@ from sb3_tdc.cli.arguments import Parser, add_settings
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import numbered
-from sb3_tdc.envs.make import import_packages, split_env_id
+from sb3_tdc.envs.registry import import_packages, split_env_id
 from sb3_tdc.experiments.jobs import cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs

@@ -1,9 +1,6 @@
 """From an environment id and hyperparameters to vectorised, wrapped, seeded environments."""
 
-import difflib
-import importlib
 import traceback
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 from sb3_tdc.envs.checked import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
 from sb3_tdc.envs.mujoco import print_warnings_once
 from sb3_tdc.envs.processes import ignore_signals
+from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.resume import Restorable
@@ -21,48 +19,6 @@ from sb3_tdc.safe_load import load_normalization
 
 # What constructors of environments, wrappers, algorithms and callbacks raise for what they do not allow
 SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportError, OSError, EOFError, gym.error.Error)
-
-
-def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
-    """
-    Split ``package:Env-v0``.
-
-    :param packages: those that are named elsewhere
-    :return: the environment's id alone, and all packages
-    """
-    package, _, env_id = env_id.rpartition(":")
-    return env_id, [*packages, *([package] if package and package not in packages else [])]
-
-
-def import_packages(packages: Sequence[str]) -> None:
-    """
-    Import packages that register environments.
-
-    :raises ValueError: for one that is not installed, with the command that installs it
-    """
-    for package in packages:
-        try:
-            importlib.import_module(package)
-        except ModuleNotFoundError as error:
-            raise ValueError(
-                f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}"
-            ) from error
-
-
-def check_env_id(env_id: str) -> None:
-    """
-    Check that an environment is registered.
-
-    :raises ValueError: naming the nearest environment, if it is not registered
-    """
-    if env_id in gym.registry:
-        return
-    close = difflib.get_close_matches(env_id, gym.registry, n=3)
-    nearest = f"; did you mean {' or '.join(close)}?" if close else "."
-    raise ValueError(
-        f"There is no environment {env_id!r}{nearest} "
-        "An environment of another package is registered by --gym-packages PACKAGE."
-    )
 
 
 def make_envs(
@@ -152,14 +108,14 @@ def _make_gymnasium(
 
 def _maker(env_id: str, hyperparams: Hyperparams, ignores_signals: bool) -> Any:
     """Return what makes one environment, perhaps in a process of its own. Its ``Monitor`` will be the outermost."""
-    spec = gym.spec(env_id)
+    spec, simulator = gym.spec(env_id), simulator_of(env_id)
 
     def make_env(**kwargs: Any) -> gym.Env:
         if ignores_signals:
             ignore_signals()
         try:
             print_warnings_once()
-            env = spec.make(**kwargs)
+            env = simulator.make(spec, kwargs)
             for wrapper in hyperparams.env_wrapper:
                 env = wrapper(env)
             return CheckedEnv(env)

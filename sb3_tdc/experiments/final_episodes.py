@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.common.files import write_atomically
 from sb3_tdc.experiments.results import Run
-from sb3_tdc.experiments.suites import PACKAGES
 from sb3_tdc.runs.trained import open_run
 
 FILE = "test_returns.npz"
@@ -83,9 +82,7 @@ def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()
     if kept is not None and len(kept) >= episodes:
         return kept[:episodes]
     before = checksum(run)
-    asked_for = run.folder.args.get("gym_packages") or []
-    known = [package for package in PACKAGES.values() if package in asked_for]
-    trained = open_run(run.folder, run.folder.model, [*packages, *known])
+    trained = open_run(run.folder, run.folder.model, packages)
     env = trained.make_env(FIRST_SEED, **(trained.eval_env_kwargs or trained.env_kwargs))
     with closing(env):
         returns = play_final_episodes(trained.load(None, "cpu"), env, episodes)

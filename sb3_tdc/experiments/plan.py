@@ -1,7 +1,6 @@
 """The runs of a suite: what there is to do, and how long it takes."""
 
 import heapq
-import importlib
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,15 +8,15 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.checks import suggest
+from sb3_tdc.envs.registry import require_env
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.experiments.results import default_settings, find_runs, same_settings
-from sb3_tdc.experiments.suites import ISAAC, PACKAGES, Cell
+from sb3_tdc.experiments.suites import ISAAC, Cell
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.settings import RunSettings
 from sb3_tdc.runs.setup import make_run
@@ -88,7 +87,6 @@ def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
         n_timesteps=n_timesteps,
         logs=logs.resolve() / length / variant / f"seed_{seed}",
         settings=settings,
-        packages=(PACKAGES[cell.env_id],) if cell.env_id in PACKAGES else (),
     )
 
 
@@ -98,12 +96,11 @@ def _why_missing(cell: Cell) -> str:
         return f"this version of the package has no {cell.algo.upper()}"
     if cell.env_id in ISAAC:
         return "Isaac Lab starts its own simulator, with environments of tensors, which train.py does not take"
-    if package := PACKAGES.get(cell.env_id):
-        try:
-            importlib.import_module(package)
-        except ImportError:
-            return f"pip install {package}"
-    return "" if cell.env_id in gym.registry else "there is no such environment"
+    try:
+        require_env(cell.env_id)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def estimate_seconds(seconds: Iterable[float], n_jobs: int) -> float:

@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.threads import set_threads
-from sb3_tdc.envs.make import check_env_id, import_packages, split_env_id
+from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.folder import RunFolder
@@ -65,7 +65,7 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
 def _prepare(settings: RunSettings) -> None:
     """Set up this process: packages that register environments, and threads."""
     import_packages(settings.gym_packages)
-    check_env_id(settings.env)
+    require_env(settings.env)
     set_threads(settings.num_threads)
 
 

@@ -10,7 +10,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.envs.checked import EnvironmentFaultError
-from sb3_tdc.envs.make import SETUP_ERRORS, check_env_id, import_packages, make_envs, split_env_id
+from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
+from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import load_model
@@ -90,7 +91,7 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
         check_imports(trained, config, consented, str(run.path))
     env_id, packages = split_env_id(trained["env"], [*trained["gym_packages"], *consented])
     import_packages(packages)
-    check_env_id(env_id)
+    require_env(env_id)
     of_the_environment = {key: value for key, value in config.items() if key in _OF_THE_ENVIRONMENT}
     gamma = {"gamma": config["gamma"]} if "gamma" in config else {}
     where = str(run.path / run.env_name / "config.yml")
@@ -122,5 +123,5 @@ def _find_normalization(run: RunFolder, path: Path) -> Path:
 
 def open_zip(path: Path, algo: str, env_id: str, trust: bool = False) -> TrainedModel:
     """Return a model that lies outside a run, with the algorithm and the registered environment that the user names."""
-    check_env_id(env_id)
+    require_env(env_id)
     return TrainedModel(path, algo, env_id, parse({"n_timesteps": 1}, ALGORITHMS[algo], str(path)), trust=trust)

@@ -1,13 +1,18 @@
 """A run that is stopped in mid-episode and resumed in a new process is the run that was never stopped, bit by bit."""
 
+import importlib.util
 import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from tests.tools.runs import CASES, CROSS, OTHERS
+from sb3_tdc.resume.environments import capture_vec_env
+from sb3_tdc.resume.kinds.table import KINDS
+from sb3_tdc.resume.walk import Capture
+from tests.tools.runs import CASES, CROSS, OTHERS, PYBULLET, bullet
 
 ROOT = Path(__file__).parents[2]
 SLOW = [
@@ -21,6 +26,11 @@ SLOW = [
 ]
 QUICK = ["Ant-v4-dummy1-plain", "Humanoid-v4-dummy2-gaussian", "Hopper-v4-subproc2-plain"]
 QUICK += [name for name in OTHERS if name not in SLOW]
+
+HAS_PYBULLET = importlib.util.find_spec("pybullet_envs_gymnasium") is not None
+if HAS_PYBULLET:
+    QUICK += ["HumanoidBulletEnv-1", "HopperBulletEnv-2"]
+    SLOW += PYBULLET
 
 
 def run_process(mode, folder, names):
@@ -57,3 +67,11 @@ def test_resumed_is_uninterrupted(quick, name):
 def test_the_whole_cross(tmp_path):
     names = [name for name in SLOW if name not in QUICK]
     assert differences(tmp_path, names)[0] == {name: [] for name in names}
+
+
+@pytest.mark.skipif(not HAS_PYBULLET, reason="needs PyBullet, which has wheels for Python 3.11 and older only")
+def test_a_world_that_pybullet_does_not_save_whole_is_not_captured():
+    """The thrown ball has no joints: resumed from PyBullet's own file, it flies elsewhere."""
+    env = DummyVecEnv([bullet("ThrowerBulletEnv-v0")])
+    (state,) = capture_vec_env(Capture(KINDS), env, "env")[0]
+    assert "PyBullet does not save all of 'thrower', a free body without joints" in state["why"]

@@ -27,6 +27,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_tdc import MEOW, TDC
 from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
+from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.resume import Restorable, ResumeStates
 
 STEPS = 300
@@ -61,6 +62,16 @@ class Reach(gym.Env):
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+def bullet(env_id: str) -> Callable[..., gym.Env]:
+    """:return: what makes one of PyBullet's tasks, as a run does"""
+
+    def make(**env_kwargs):
+        require_env(env_id)
+        return simulator_of(env_id).make(gym.spec(env_id), env_kwargs)
+
+    return make
 
 
 @dataclass
@@ -153,7 +164,15 @@ OTHERS = {
         wrapper_class=lambda env: gym.wrappers.NormalizeReward(gym.wrappers.DelayObservation(env, 2)),
     ),
 }
-CASES = {**CROSS, **OTHERS}
+BULLET = ("HalfCheetah", "Hopper", "Ant", "Humanoid", "Walker2D", "InvertedDoublePendulum", "Reacher")
+PYBULLET = {
+    f"{name}BulletEnv-{n_envs}": Case(
+        bullet(f"{name}BulletEnv-v0"), n_envs=n_envs, vec_env=vec_env, wrapper_class=wrapper_class
+    )
+    for name in BULLET
+    for n_envs, vec_env, wrapper_class in ((1, DummyVecEnv, None), (2, SubprocVecEnv, Restorable))
+}
+CASES = {**CROSS, **OTHERS, **PYBULLET}
 
 
 class Trace(BaseCallback):

@@ -33,6 +33,8 @@ _CODE += (types.MethodDescriptorType, types.WrapperDescriptorType, types.ClassMe
 _WITHOUT_STATE = ("gymnasium.envs.mujoco.mujoco_rendering.", "pygame.", "_csv.")
 # Simulators that are reached by a number or a proxy: the Python objects that use them look as if they could be captured
 _NATIVE_PACKAGES = {"pybullet", "pybullet_data", "pybullet_utils", "Box2D", "ale_py", "isaacgym"}
+# Packages whose classes reach their simulator through an object that is captured (a BulletClient) alone
+_REACHED_BY_OBJECTS = {"pybullet_envs_gymnasium"}
 # Classes that may come to be where there was another, or nothing
 _BUILTIN: dict[str, type] = {
     name_of(kind): kind
@@ -257,6 +259,8 @@ def is_python_object(value: Any) -> bool:
 
 def _uses_native_package(kind: type) -> str | None:
     for cls in kind.__mro__:
+        if cls.__module__.partition(".")[0] in _REACHED_BY_OBJECTS:
+            continue
         module = sys.modules.get(cls.__module__)
         packages = {cls.__module__.partition(".")[0]}
         packages |= {

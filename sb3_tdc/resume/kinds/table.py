@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 import torch as th
 
-from sb3_tdc.resume import environments, mujoco
+from sb3_tdc.resume import environments, mujoco, pybullet
 from sb3_tdc.resume.kinds import arrays, containers, generators, objects
 from sb3_tdc.resume.walk import Kind, Kinds, name_of, plain
 
@@ -168,6 +168,12 @@ KINDS: Kinds = {
         lambda context, v, path: None,
         mujoco.restore_mj_model,
         needs=lambda content: "MuJoCo's MjModel",
+    ),
+    "BulletClient": plain(
+        pybullet.is_client,
+        pybullet.capture_world,
+        pybullet.restore_world,
+        needs=lambda content: "a PyBullet world",
     ),
     "environments": Kind(
         environments.is_vec_env,

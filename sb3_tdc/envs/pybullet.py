@@ -1,0 +1,61 @@
+"""PyBullet's tasks (``HopperBulletEnv-v0``, …): registered on demand, without the simulator's own output."""
+
+import ctypes
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from sb3_tdc.envs.simulator import Simulator
+
+_PACKAGE = "pybullet_envs_gymnasium"
+
+
+def register() -> None:
+    """
+    Register the tasks.
+
+    :raises ValueError: if PyBullet is not installed, with the command that installs it
+    """
+    try:
+        with _quiet():
+            importlib.import_module("pybullet")
+            importlib.import_module(_PACKAGE)
+    except ImportError as error:
+        wheels = "" if sys.version_info < (3, 12) else " (PyBullet has wheels for Python 3.11 and older only)"
+        raise ValueError(f'PyBullet\'s environments need: pip install "sb3-tdc[pybullet]"{wheels}') from error
+
+
+def make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
+    """Make an environment, and load its world now, not at the first reset: exact resume restores into what is there."""
+    with _quiet():
+        env = spec.make(**env_kwargs)
+        env.reset(seed=0)
+    return env
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Drop what C code prints: PyBullet announces itself at its import and at every connection."""
+    libc = ctypes.CDLL(None)
+    sys.stdout.flush()
+    libc.fflush(None)
+    kept, nothing = {fd: os.dup(fd) for fd in (1, 2)}, os.open(os.devnull, os.O_WRONLY)
+    for fd in kept:
+        os.dup2(nothing, fd)
+    try:
+        yield
+    finally:
+        libc.fflush(None)
+        for fd, copy in kept.items():
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(nothing)
+
+
+PYBULLET = Simulator(provides=lambda env_id: "BulletEnv-" in env_id, register=register, make=make)

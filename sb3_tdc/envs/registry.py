@@ -1,0 +1,63 @@
+"""From an environment id to a registered environment: packages, simulators, and what to say if there is none."""
+
+import difflib
+import importlib
+from collections.abc import Sequence
+
+import gymnasium as gym
+
+from sb3_tdc.envs.pybullet import PYBULLET
+from sb3_tdc.envs.simulator import GYMNASIUM, Simulator
+
+# The first that provides an environment registers and makes it
+SIMULATORS = (PYBULLET, GYMNASIUM)
+
+
+def simulator_of(env_id: str) -> Simulator:
+    """Return the simulator that provides an environment."""
+    return next(simulator for simulator in SIMULATORS if simulator.provides(env_id))
+
+
+def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
+    """
+    Split ``package:Env-v0``.
+
+    :param packages: those that are named elsewhere
+    :return: the environment's id alone, and all packages
+    """
+    package, _, env_id = env_id.rpartition(":")
+    return env_id, [*packages, *([package] if package and package not in packages else [])]
+
+
+def import_packages(packages: Sequence[str]) -> None:
+    """
+    Import packages that register environments.
+
+    :raises ValueError: for one that is not installed, with the command that installs it
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}"
+            ) from error
+
+
+def require_env(env_id: str) -> None:
+    """
+    Let the simulator of an environment register it, and check that it is registered.
+
+    :raises ValueError: if the simulator is not installed, with the command that installs it; if there is no such
+        environment, with the nearest
+    """
+    if env_id not in gym.registry:
+        simulator_of(env_id).register()
+    if env_id in gym.registry:
+        return
+    close = difflib.get_close_matches(env_id, gym.registry, n=3)
+    nearest = f"; did you mean {' or '.join(close)}?" if close else "."
+    raise ValueError(
+        f"There is no environment {env_id!r}{nearest} "
+        "An environment of another package is registered by --gym-packages PACKAGE."
+    )

@@ -1,0 +1,48 @@
+"""PyBullet's worlds, captured bit for bit in its own format. Imports PyBullet only to read what is there."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from sb3_tdc.resume.walk import MISSING, NotCapturedError, NotRestoredError
+
+
+def is_client(value: Any) -> bool:
+    """Return whether a value is a connection to a world."""
+    return type(value).__name__ == "BulletClient" and type(value).__module__.startswith("pybullet_utils")
+
+
+def capture_world(client: Any) -> dict[str, Any]:
+    """
+    Positions, velocities, contacts with the impulses from which the solver starts; and what bodies there are.
+
+    :raises NotCapturedError: if a free body has no joints: resumed from PyBullet's file, it moves differently
+    """
+    for number in range(client.getNumBodies()):
+        if client.getNumJoints(number) == 0 and client.getDynamicsInfo(number, -1)[0] > 0:
+            name = client.getBodyInfo(number)[1].decode()
+            raise NotCapturedError(f"PyBullet does not save all of {name!r}, a free body without joints")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "world.bullet"
+        client.saveBullet(str(file))
+        if not file.is_file():
+            raise NotCapturedError("PyBullet cannot save its world")
+        return {"bodies": _bodies(client), "world": file.read_bytes()}
+
+
+def restore_world(existing: Any, state: dict[str, Any]) -> Any:
+    """Give an existing world its state, if it has the same bodies; return its client."""
+    if existing is MISSING or not is_client(existing):
+        raise NotRestoredError("there is no PyBullet world to be restored")
+    if _bodies(existing) != state["bodies"]:
+        raise NotRestoredError("PyBullet's world has other bodies now")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "world.bullet"
+        file.write_bytes(state["world"])
+        existing.restoreState(fileName=str(file))
+    return existing
+
+
+def _bodies(client: Any) -> list[str]:
+    """Return the names of all bodies, in the order in which they were loaded, with their numbers of joints."""
+    return [f"{client.getBodyInfo(n)}, {client.getNumJoints(n)} joints" for n in range(client.getNumBodies())]
