@@ -1,6 +1,7 @@
 """From an environment id and hyperparameters to vectorised, wrapped, seeded environments."""
 
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def make_envs(
     :param training: False: statistics stay as they are and rewards are not normalised
     :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
     """
-    make = _make_gymnasium if vec_env == "gymnasium" else _make_sb3
+    make = _how_to_make(env_id, vec_env)
     kwargs = {**hyperparams.env_kwargs, **(env_kwargs or {})}
     env = make(env_id, hyperparams, seed, n_envs, kwargs, monitor_folder, vec_env == "subproc")
     for wrapper in hyperparams.vec_env_wrapper:
@@ -58,6 +59,39 @@ def make_envs(
         if not training:
             env.training, env.norm_reward = False, False
     return env
+
+
+def _how_to_make(env_id: str, vec_env: str) -> Callable[..., VecEnv]:
+    if simulator_of(env_id).make_vec is None:
+        return _make_gymnasium if vec_env == "gymnasium" else _make_sb3
+    if vec_env != "dummy":
+        raise ValueError(f"{env_id} steps all environments in one simulation: leave out --vec-env {vec_env}")
+    return _make_at_once
+
+
+def _make_at_once(
+    env_id: str,
+    hyperparams: Hyperparams,
+    seed: int,
+    n_envs: int,
+    env_kwargs: dict[str, Any],
+    monitor_folder: Path | None,
+    is_subproc: bool,
+) -> VecEnv:
+    make_vec = simulator_of(env_id).make_vec
+    assert make_vec is not None
+    _require_no_wrappers(env_id, hyperparams)
+    return _monitored(make_vec(env_id, n_envs, seed, env_kwargs), hyperparams, monitor_folder)
+
+
+def _require_no_wrappers(env_id: str, hyperparams: Hyperparams) -> None:
+    if hyperparams.env_wrapper:
+        raise ValueError(f"{env_id} is vectorised by itself: env_wrapper cannot wrap its single environments")
+
+
+def _monitored(env: VecEnv, hyperparams: Hyperparams, monitor_folder: Path | None) -> VecEnv:
+    file = str(monitor_folder / "0") if monitor_folder is not None else None
+    return VecMonitor(env, file, tuple(hyperparams.monitor_kwargs.get("info_keywords", ())))
 
 
 def _make_sb3(
@@ -94,16 +128,14 @@ def _make_gymnasium(
     spec = gym.spec(env_id)
     print_warnings_once()
     if spec.vector_entry_point is not None:
-        if hyperparams.env_wrapper:
-            raise ValueError(f"{env_id} is vectorised by itself: env_wrapper cannot wrap its single environments")
+        _require_no_wrappers(env_id, hyperparams)
         vector = gym.make_vec(env_id, num_envs=n_envs, **env_kwargs)
     else:
         single = _maker(env_id, hyperparams, ignores_signals=False)
         vector = gym.vector.SyncVectorEnv([lambda: single(**env_kwargs)] * n_envs, autoreset_mode="SameStep")
     env = GymnasiumVecEnv(vector)
     env.seed(seed)
-    file = str(monitor_folder / "0") if monitor_folder is not None else None
-    return VecMonitor(env, file, tuple(hyperparams.monitor_kwargs.get("info_keywords", ())))
+    return _monitored(env, hyperparams, monitor_folder)
 
 
 def _maker(env_id: str, hyperparams: Hyperparams, ignores_signals: bool) -> Any:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import gymnasium as gym
 
+from sb3_tdc.envs.isaac import ISAAC
 from sb3_tdc.envs.pybullet import PYBULLET
 from sb3_tdc.envs.simulator import GYMNASIUM, Simulator
 
 # The first that provides an environment registers and makes it
-SIMULATORS = (PYBULLET, GYMNASIUM)
+SIMULATORS = (PYBULLET, ISAAC, GYMNASIUM)
 
 
 def simulator_of(env_id: str) -> Simulator:

@@ -16,7 +16,7 @@ from sb3_tdc.common.checks import suggest
 from sb3_tdc.envs.registry import require_env
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.experiments.results import default_settings, find_runs, same_settings
-from sb3_tdc.experiments.suites import ISAAC, Cell
+from sb3_tdc.experiments.suites import Cell
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.settings import RunSettings
 from sb3_tdc.runs.setup import make_run
@@ -94,8 +94,6 @@ def _why_missing(cell: Cell) -> str:
     """Return why a cell cannot be run here, or ""."""
     if cell.algo not in ALGORITHMS:
         return f"this version of the package has no {cell.algo.upper()}"
-    if cell.env_id in ISAAC:
-        return "Isaac Lab starts its own simulator, with environments of tensors, which train.py does not take"
     try:
         require_env(cell.env_id)
     except ValueError as error:

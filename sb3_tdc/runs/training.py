@@ -29,6 +29,7 @@ from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.envs.checked import EnvironmentFaultError, describe_exception
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.processes import closing_envs, ended_processes
+from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.resume import LockedError, NotRestoredError, ResumeStates, stored_steps
 from sb3_tdc.runs.callbacks.busy_machine import BusyMachine
@@ -297,13 +298,21 @@ def _make_callbacks(
         callbacks.append(FiniteGuard())
     if states is not None:
         callbacks.append(states)
+    can_evaluate = simulator_of(settings.env).make_vec is None
     if isinstance(model, Advised):
+        if not can_evaluate:
+            raise ValueError(f"{settings.env} allows one simulation a process: none for the board's test episodes")
         callbacks.append(BoardCallback(_make_other_envs(run, model, stack, _BOARD_SEED, 1, settings.env_kwargs)))
     callbacks += [make() for make in hyperparams.callbacks]
     identity = {"algo": settings.algo, "env": settings.env, "seed": settings.seed}
     callbacks.append(RecordHyperparams(identity | hyperparams.raw))
     callbacks += _make_saving(run)
-    callbacks += _make_evaluation(run, model, progress, stop, stack)
+    if can_evaluate:
+        callbacks += _make_evaluation(run, model, progress, stop, stack)
+    elif settings.eval_freq > 0:
+        progress.say(
+            f"{settings.env} allows one simulation a process: no evaluations, rollout/ep_rew_mean is the return"
+        )
     return [*callbacks, progress, stop]
 
 

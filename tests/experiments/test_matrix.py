@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 from sb3_tdc import TDC
@@ -40,10 +41,15 @@ def test_cells_of_two_suites_may_be_one_job():
     assert [(job.settings, job.logs) for job in jobs] == [({}, Path("/logs/scale_1/seed_1"))]
 
 
-def test_other_simulators_are_missing_with_a_hint():
+def test_other_simulators_are_missing_with_a_hint(monkeypatch):
+    for env_id in [env_id for env_id in gym.registry if "BulletEnv" in env_id]:
+        monkeypatch.delitem(gym.registry, env_id)
+    monkeypatch.setitem(sys.modules, "pybullet", None)  # as if it were not installed
     missing = plan("fig5").missing
-    assert "tdc on HopperBulletEnv-v0: pip install pybullet_envs_gymnasium" in missing
-    assert any("Isaac Lab" in sentence for sentence in missing)
+    assert any(
+        each.startswith("tdc on HopperBulletEnv-v0: ") and 'pip install "sb3-tdc[pybullet]"' in each for each in missing
+    )
+    assert any("sac on Isaac-Franka-Cabinet-Direct-v0: Isaac Lab's environments need" in each for each in missing)
 
 
 def test_scaled():

@@ -33,6 +33,7 @@ _CODE += (types.MethodDescriptorType, types.WrapperDescriptorType, types.ClassMe
 _WITHOUT_STATE = ("gymnasium.envs.mujoco.mujoco_rendering.", "pygame.", "_csv.")
 # Simulators that are reached by a number or a proxy: the Python objects that use them look as if they could be captured
 _NATIVE_PACKAGES = {"pybullet", "pybullet_data", "pybullet_utils", "Box2D", "ale_py", "isaacgym"}
+_NATIVE_PACKAGES |= {"isaaclab", "isaaclab_rl", "isaacsim", "omni", "warp"}
 # Packages whose classes reach their simulator through an object that is captured (a BulletClient) alone
 _REACHED_BY_OBJECTS = {"pybullet_envs_gymnasium"}
 # Classes that may come to be where there was another, or nothing

@@ -1,0 +1,145 @@
+"""
+Isaac Lab's tasks (``Isaac-…-v0``): the application first, then the tasks, then Isaac Lab's own ``Sb3VecEnvWrapper``.
+
+Written against the three published interfaces of that wrapper: with ``fast_variant`` (Isaac Lab 2.3), then with
+``action_low`` and ``action_high``, then with ``action_bounds`` (September 2026). What they do differently is corrected
+by what they do, whichever it is. It has been run with a stand-in for each of them, not with Isaac Sim itself.
+"""
+
+import importlib.util
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_tdc.envs.simulator import Simulator
+
+_INSTALL = "https://isaac-sim.github.io/IsaacLab/main/source/setup/installation"
+
+
+class IsaacVecEnv(VecEnvWrapper):
+    """
+    What SB3's off-policy algorithms need of a ``VecEnv``, around Isaac Lab's.
+
+    - Actions without bounds are in [-1, 1]. Isaac Lab gave them [-100, 100], over which tanh spreads them (issue 5080).
+    - The last observation of an episode is the one before the reset. Where Isaac Lab gives the one after the reset
+      instead, a time-out counts as the end of the task: there is nothing to bootstrap from.
+    - Attributes and wrappers are those of all environments.
+
+    :param env: a ``Sb3VecEnvWrapper`` of any interface
+    """
+
+    def __init__(self, env: VecEnv):
+        space: Any = env.unwrapped.single_action_space  # type: ignore[attr-defined]  # of the task, not of the wrapper
+        is_unbounded = isinstance(space, spaces.Box) and not space.is_bounded("both")
+        action_space = spaces.Box(-1.0, 1.0, space.shape, np.float32) if is_unbounded else env.action_space
+        super().__init__(env, action_space=action_space)
+        self.has_last_observations = True
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for i in map(int, np.flatnonzero(dones)):
+            if _is_same(infos[i]["terminal_observation"], observations, i):
+                self._end_without_last_observation(infos[i])
+        return observations, rewards, dones, infos
+
+    def _end_without_last_observation(self, info: dict[str, Any]) -> None:
+        info["TimeLimit.truncated"] = False
+        if self.has_last_observations:
+            self.has_last_observations = False
+            warnings.warn(
+                "This version of Isaac Lab gives no last observation of an episode (compute_final_obs): "
+                "time-outs count as the end of the task, and values are not bootstrapped through them",
+                stacklevel=2,
+            )
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError(f"Isaac Lab cannot set attributes of its environments ({attr_name})")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+    def render(self, mode: str | None = None) -> np.ndarray | None:
+        frame: Any = self.venv.env_method("render")
+        return frame
+
+
+def _is_same(last: Any, observations: Any, i: int) -> bool:
+    if isinstance(last, dict):
+        return all(_is_same(last[key], observations[key], i) for key in last)
+    return bool(np.array_equal(last, observations[i], equal_nan=True))
+
+
+def register() -> None:
+    """
+    Start the application, in which alone the tasks can be imported, and register them.
+
+    :raises ValueError: if Isaac Lab is not installed, with where to find out how
+    """
+    try:
+        if not _is_installed():
+            raise ModuleNotFoundError(name="isaaclab_tasks")
+        with _without_arguments():
+            importlib.import_module("isaaclab.app").AppLauncher(headless=True)
+        importlib.import_module("isaaclab_tasks")
+    except ImportError as error:
+        raise ValueError(f"Isaac Lab's environments need Isaac Lab and Isaac Sim ({error.name}): {_INSTALL}") from error
+
+
+def _is_installed() -> bool:
+    return importlib.util.find_spec("isaaclab_tasks") is not None
+
+
+@contextmanager
+def _without_arguments() -> Iterator[None]:
+    """The application would read the arguments of ``sb3-tdc train`` as its own."""
+    arguments, sys.argv = sys.argv, sys.argv[:1]
+    try:
+        yield
+    finally:
+        sys.argv = arguments
+
+
+def make_vec(env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]) -> VecEnv:
+    """
+    Make all environments: one simulation, in which they are stepped together.
+
+    :param env_kwargs: over the task's configuration, with dots for what is inside (``sim.dt``), but for ``device``,
+        the simulation's, and ``render_mode``
+    :raises ValueError: for a setting that the configuration does not have
+    """
+    settings = {"device": "cuda:0", "render_mode": None, **env_kwargs}
+    parse = importlib.import_module("isaaclab_tasks.utils").parse_env_cfg
+    config = parse(env_id, device=settings.pop("device"), num_envs=n_envs)
+    config.seed = seed
+    if hasattr(config, "compute_final_obs"):
+        config.compute_final_obs = True
+    render_mode = settings.pop("render_mode")
+    for name, value in settings.items():
+        _set(config, name, value, env_id)
+    wrapper = importlib.import_module("isaaclab_rl.sb3").Sb3VecEnvWrapper
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*unbounded action space")  # it has bounds here
+        return IsaacVecEnv(wrapper(gym.make(env_id, cfg=config, render_mode=render_mode)))
+
+
+def _set(config: Any, name: str, value: Any, env_id: str) -> None:
+    *path, last = name.split(".")
+    for part in path:
+        config = getattr(config, part, None)
+    if not hasattr(config, last):
+        raise ValueError(f"the configuration of {env_id} has no {name}")
+    setattr(config, last, value)
+
+
+ISAAC = Simulator(provides=lambda env_id: env_id.startswith("Isaac-"), register=register, make_vec=make_vec)
