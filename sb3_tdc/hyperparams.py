@@ -36,7 +36,7 @@ _RUN_KEYS: dict[str, Any] = {
     "env_kwargs": dict[str, Any],
     "monitor_kwargs": dict[str, Any],
     "noise_type": str | None,
-    "noise_std": float,
+    "noise_std": float | list[float],
 }
 # Keyword arguments that belong to one run, not to an environment: train.py has flags for them
 _FLAGS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
@@ -59,7 +59,8 @@ class Hyperparams:
     :param env_wrapper: callables that take and return an environment
     :param vec_env_wrapper: the same for a vectorised environment
     :param callbacks: factories of callbacks
-    :param noise_std: standard deviation of the action noise of ``noise_type``, in normalised action units
+    :param noise_std: standard deviation of the action noise of ``noise_type``, in normalised action units; of two
+        values, the first is that of the first environment, the second that of the last
     """
 
     raw: dict[str, Any]
@@ -74,7 +75,7 @@ class Hyperparams:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     monitor_kwargs: dict[str, Any] = field(default_factory=dict)
     noise_type: str | None = None
-    noise_std: float = 0.0
+    noise_std: float | list[float] = 0.0
 
 
 def hyperparams_file(algo: str) -> Path:
@@ -138,6 +139,10 @@ def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> 
     for key in ("n_timesteps", "n_envs", "frame_stack"):
         if values.get(key) is not None and values[key] < 1:
             raise ValueError(f"{where}: {key} must be at least 1, got {values[key]}")
+    if isinstance(sigmas := values.get("noise_std"), list) and (
+        len(sigmas) != 2 or values.get("noise_type") != "normal"
+    ):
+        raise ValueError(f"{where}: noise_std must be a number, or two with noise_type normal, got {sigmas}")
     if values.get("noise_type") not in (None, *_NOISE_TYPES):
         raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {values['noise_type']!r}")
     _convert_policy(values, algorithm, where)

@@ -10,7 +10,7 @@ Gymnasium gets there depends on the autoreset mode:
 - DISABLED: the caller has to reset it, which is done here.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -180,10 +180,10 @@ def split_infos(infos: dict[str, Any], n_envs: int) -> list[dict[str, Any]]:
     for name in names:
         mask = to_numpy(infos.get(f"_{name}", np.ones(n_envs, dtype=bool)))
         values = infos[name]
-        parts: Iterable[Any] = split_infos(values, n_envs) if isinstance(values, dict) else values
-        for i, value in enumerate(parts):
-            if mask[i]:
-                split[i][name] = value
+        parts: Any = split_infos(values, n_envs) if isinstance(values, dict) else values
+        parts = to_numpy(parts) if hasattr(parts, "detach") else parts
+        for i in map(int, np.flatnonzero(mask)):
+            split[i][name] = parts[i]
     return split
 
 

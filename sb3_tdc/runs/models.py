@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.files import write_atomically
+from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.runs.callbacks.finite_guard import check_weights
 from sb3_tdc.runs.folder import RunFolder
@@ -107,7 +108,10 @@ def _action_noise(hyperparams: Hyperparams, env: VecEnv) -> dict[str, Any]:
     """Return the keyword argument for RL Zoo's ``noise_type``, if there is one."""
     if hyperparams.noise_type is None:
         return {}
-    noise = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}[hyperparams.noise_type]
     shape = env.action_space.shape
     assert shape is not None
-    return {"action_noise": noise(np.zeros(shape), np.full(shape, hyperparams.noise_std))}
+    zeros, sigmas = np.zeros(shape), [np.full(shape, sigma) for sigma in np.atleast_1d(hyperparams.noise_std)]
+    if hyperparams.noise_type != "normal":
+        return {"action_noise": OrnsteinUhlenbeckActionNoise(zeros, sigmas[0])}
+    noise = NormalNoiseRange(zeros, *sigmas) if len(sigmas) == 2 else NormalActionNoise(zeros, sigmas[0])
+    return {"action_noise": noise_of_all(noise, env.num_envs)}

@@ -68,6 +68,9 @@ class RunSettings:
     conf_file: Path | None = setting(
         "-conf", "--conf-file", default=None, help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)"
     )
+    preset: str | None = setting(
+        default=None, help="entry of that file instead of the environment's (parallel: for thousands of environments)"
+    )
     trained_agent: Path | None = setting(
         "-i", "--trained-agent", default=None, role=Role.EXPERIMENT, help="zip of a model to continue from"
     )

@@ -46,7 +46,10 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
     :raises ValueError: naming the source of what is not allowed
     """
     path = settings.conf_file or hyperparams_file(settings.algo)
-    entry, name = read_entry(path, settings.env)
+    wanted = settings.preset or settings.env
+    entry, name = read_entry(path, wanted)
+    if settings.preset not in (None, name):
+        raise ValueError(f"--preset: {path} has no entry {settings.preset}")
     n_timesteps = {"n_timesteps": settings.n_timesteps} if settings.n_timesteps > 0 else {}
     overrides = {**settings.hyperparams, **n_timesteps}
     algorithm = ALGORITHMS[settings.algo]
@@ -56,7 +59,7 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
     hyperparams = parse({**entry, **overrides}, algorithm, where)
     if settings.verbose > 0:
         nearest = "" if name == "default" else "; this is the nearest version"
-        other = "" if name == settings.env else f" (it has no entry for {settings.env}{nearest})"
+        other = "" if name == wanted else f" (it has no entry for {settings.env}{nearest})"
         print(f"Hyperparameters: {where}{other}")
         print(textwrap.indent(plain_yaml.dump(hyperparams.raw, sort_keys=False), "  "), end="")
     return hyperparams

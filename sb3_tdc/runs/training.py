@@ -31,7 +31,7 @@ from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.processes import closing_envs, ended_processes
 from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.hyperparams import Hyperparams
-from sb3_tdc.resume import LockedError, NotRestoredError, ResumeStates, stored_steps
+from sb3_tdc.resume import DEFAULT_FREQ, LockedError, NotRestoredError, ResumeStates, stored_steps
 from sb3_tdc.runs.callbacks.busy_machine import BusyMachine
 from sb3_tdc.runs.callbacks.critic_evaluation import CriticEvaluation
 from sb3_tdc.runs.callbacks.finite_guard import FiniteGuard, divergence_named
@@ -78,9 +78,15 @@ class TrainingRun:
 
     @property
     def log_interval(self) -> int | None:
-        """Episodes between log entries; None for none."""
+        """Episodes between log entries; None for none. By default, at most one entry a step of all environments."""
         given = self.settings.log_interval
-        return 4 if given == -1 else max(given, 0) or None
+        return max(4, self.hyperparams.n_envs) if given == -1 else max(given, 0) or None
+
+    @property
+    def resume_freq(self) -> int:
+        """Environment steps between resume states. By default, at most one in 100 steps of all environments."""
+        given = self.settings.resume_freq
+        return max(given, 100 * self.hyperparams.n_envs) if given == DEFAULT_FREQ else given
 
 
 class NotSavedError(Exception):
@@ -199,7 +205,7 @@ def _open_states(run: TrainingRun) -> ResumeStates | None:
     of_evaluations = [folder.best_model, folder.normalization(folder.best_model)]
     states = ResumeStates(
         folder.resume_folder,
-        settings.resume_freq,
+        run.resume_freq,
         files=of_evaluations if settings.eval_freq > 0 else [],
         hyperparams=run.hyperparams.raw,
         verbose=settings.verbose,

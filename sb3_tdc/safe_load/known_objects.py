@@ -20,6 +20,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 
 from sb3_tdc.common.checks import check_integer, check_number
+from sb3_tdc.common.noise import NormalNoiseRange
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
 
@@ -157,8 +158,16 @@ def _ornstein_uhlenbeck_noise(call: Call, make: Rebuild) -> OrnsteinUhlenbeckAct
     )
 
 
-def _noise_arrays(call: Call, make: Rebuild) -> tuple[np.ndarray, np.ndarray]:
-    mean, sigma = (np.asarray(value, dtype=float) for value in _attributes(call, make, "_mu", "_sigma"))
+def _noise_range(call: Call, make: Rebuild) -> NormalNoiseRange:
+    mean, sigma = _noise_arrays(call, make)
+    largest = _noise_arrays(call, make, "largest")[1]
+    if largest.shape != sigma.shape:
+        raise UnsafeFileError("a range of noise without two ends of one shape")
+    return NormalNoiseRange(mean, sigma, largest)
+
+
+def _noise_arrays(call: Call, make: Rebuild, sigma_name: str = "_sigma") -> tuple[np.ndarray, np.ndarray]:
+    mean, sigma = (np.asarray(value, dtype=float) for value in _attributes(call, make, "_mu", sigma_name))
     if not (np.isfinite(mean).all() and np.isfinite(sigma).all()):
         raise UnsafeFileError("noise that is not finite")
     return mean, sigma
@@ -265,6 +274,8 @@ CALLS: dict[Name, Handler] = {
     Name(f"{_SB3}.noise", "NormalActionNoise"): _object(_normal_noise),
     Name(f"{_SB3}.noise", "OrnsteinUhlenbeckActionNoise"): _object(_ornstein_uhlenbeck_noise),
     Name(f"{_SB3}.noise", "VectorizedActionNoise"): _object(_base_noise),
+    Name("sb3_tdc.common.noise", "NormalNoiseRange"): _object(_noise_range),
+    Name("sb3_tdc.common.noise", "VectorizedNormalNoise"): _object(_base_noise),
     Name(f"{_SB3}.utils", "LinearSchedule"): _object(_linear_schedule),
     Name(f"{_SB3}.utils", "ConstantSchedule"): _object(_constant_schedule),
     Name(f"{_SB3}.utils", "FloatSchedule"): _object(_float_schedule),

@@ -23,6 +23,7 @@ from torch import nn
 from sb3_tdc.common.checks import check_action_space, check_integer, check_number
 from sb3_tdc.common.dormant import dormant_share, relu_activations
 from sb3_tdc.common.layers import StackedLinear
+from sb3_tdc.common.noise import noise_of_all
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
 from sb3_tdc.common.versions import numba_version
@@ -301,7 +302,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
             noise = noise.base_noise
         if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise) and n_envs > 1:
-            noise = VectorizedActionNoise(noise, n_envs)
+            noise = noise_of_all(noise, n_envs)
         vars(self)["action_noise"] = noise
 
     def _setup_fused_update(self) -> None:

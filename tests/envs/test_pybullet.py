@@ -1,4 +1,4 @@
-"""PyBullet's tasks: registered on demand, quiet, recorded like the others. Exact resume: ``tests/resume/test_parity.py``."""
+"""PyBullet's tasks: registered on demand, quiet, recorded like the others. Exact resume is in ``tests/resume``."""
 
 import subprocess
 import sys
