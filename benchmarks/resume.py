@@ -1,9 +1,9 @@
 """
 What states cost: how long training waits for them, and what they write.
 
-``python -m benchmarks.states`` trains TDC with the paper's hyperparameters for a few thousand steps, for the time
+``python -m benchmarks.resume`` trains TDC with the paper's hyperparameters for a few thousand steps, for the time
 of a step, then continues without updates until states have been written (their pause is the same), prints a table
-and writes it to ``docs/benchmarks/states.md``.
+and writes it to ``docs/benchmarks/resume.md``.
 """
 
 import argparse
@@ -108,14 +108,14 @@ def main() -> None:
     parser.add_argument("--freq", type=int, default=DEFAULT_FREQ, help="steps between states")
     parser.add_argument("--num-threads", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="where to write them (default: a temporary folder)")
-    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks/states.md"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks/resume.md"))
     args = parser.parse_args()
     th.set_num_threads(args.num_threads)
     results = {}
     for env_id in args.envs:
         with tempfile.TemporaryDirectory(dir=args.folder) as folder:
             results[env_id] = measure(env_id, args.states, args.freq, Path(folder))
-    text = report(results, f"python -m benchmarks.states --states {args.states} --freq {args.freq}")
+    text = report(results, f"python -m benchmarks.resume --states {args.states} --freq {args.freq}")
     print(text)
     args.output.write_text(text)
 
