@@ -79,10 +79,10 @@ class Hyperparams:
 
 
 def hyperparams_file(algo: str) -> Path:
-    """Return the file of an algorithm that comes with this package."""
+    """Return the file of an algorithm that comes with this package; a variant (``tdc-shift``) has its algorithm's."""
     package = Path(__file__).parent
     installed, checkout = package / "_hyperparams", package.parent / "hyperparams"
-    return (installed if installed.is_dir() else checkout) / f"{algo}.yml"
+    return (installed if installed.is_dir() else checkout) / f"{algo.partition('-')[0]}.yml"
 
 
 def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], str]:

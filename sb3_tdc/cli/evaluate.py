@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
 from sb3_tdc.experiments.results import find_runs
 
@@ -16,6 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, or 1 if a run could not be tested
     """
+    know_ablations()
     parser = Parser("evaluate", "Play test episodes with every finished run; what has been played is not played again.")
     parser.add_argument("logs", type=Path, help="folder of runs")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes for each run")

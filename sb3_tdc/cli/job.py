@@ -7,10 +7,12 @@ import threading
 from collections.abc import Sequence
 
 from sb3_tdc.cli import train
+from sb3_tdc.experiments.ablations import know_ablations
 
 
 def main(argv: Sequence[str]) -> int:
     """Return the exit status of ``sb3-tdc train``."""
+    know_ablations()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     sys.orig_argv = ["sb3-tdc", "train", *argv]  # what to type to do the same, for the run's command.txt
     return train.main(argv)

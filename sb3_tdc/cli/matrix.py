@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sb3_tdc.cli.arguments import Names, Parser, one_of
 from sb3_tdc.common.commands import command
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.jobs import Job, cluster, count_cores
 from sb3_tdc.experiments.matrix import run_jobs
 from sb3_tdc.experiments.plan import Plan, dry_run, make_plan, read_rates, select
@@ -77,6 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0 if all that can be run is finished, 1 if something failed, 130 if the user stopped it
     """
+    know_ablations()
     parser = make_parser()
     args = parser.parse_args(argv)
     try:

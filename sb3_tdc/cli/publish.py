@@ -7,6 +7,7 @@ from pathlib import Path
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.commands import command
 from sb3_tdc.experiments import final_episodes as test_returns
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.publish import RESULTS, publish
 from sb3_tdc.experiments.results import find_runs
 
@@ -18,6 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, or 1 if a finished run has not played its test episodes
     """
+    know_ablations()
     parser = Parser(
         "publish", "Copy the small files of all finished runs: evaluations, settings, versions, test returns, the log."
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.files import check_writable
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.report import write_report
 from sb3_tdc.experiments.results import find_runs
 
@@ -16,6 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0
     """
+    know_ablations()
     parser = Parser("report", "Make one HTML page of all runs in a folder, with figures and tables next to it.")
     parser.add_argument("logs", type=Path, help="folder of runs")
     parser.add_argument("-o", "--output", type=Path, help="folder to write to (report/ in the folder of runs)")

@@ -70,23 +70,53 @@ class Episode:
         return np.stack([observed_frequency(quantiles, self.returns[known]) for quantiles in critics])
 
 
+def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
+    """
+    Return Spearman's rank correlation, of numbers without ties.
+
+    :param x: (T,)
+    :param y: (T,)
+    :return: between −1 and 1; NaN if there are fewer than 3, or all are equal
+    """
+    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return float("nan")
+    ranks = np.stack([np.argsort(np.argsort(values)) for values in (x, y)])
+    matrix: Any = np.corrcoef(ranks)
+    return float(matrix[0, 1])
+
+
 def summarise(episodes: Sequence[Episode]) -> dict[str, float]:
     """
-    Summarise episodes in two numbers.
+    Summarise episodes in three numbers.
 
     :return: ``overestimation`` (mean over steps and critics, in units of the critics' return) and
         ``calibration_error`` (mean over levels and critics of |observed − nominal|, between 0 and 0.5 or so), every
-        episode with the same weight; without episodes of known returns, nothing
+        episode with the same weight; ``std_error_correlation``, of σ and |G − μ| by ranks over the steps of all
+        episodes, mean over critics; without episodes of known returns, nothing
     """
     known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
     if not known:
         return {}
     frequencies = np.mean([episode.frequencies for episode in known], axis=0)
     levels = quantile_midpoints(frequencies.shape[1]).numpy()
-    return {
+    summary = {
         "overestimation": float(np.mean([np.nanmean(episode.overestimation) for episode in known])),
         "calibration_error": float(np.abs(frequencies - levels).mean()),
     }
+    correlation = np.mean([rank_correlation(*pairs) for pairs in spread_and_error(known)])
+    return summary | ({"std_error_correlation": float(correlation)} if np.isfinite(correlation) else {})
+
+
+def spread_and_error(episodes: Sequence[Episode]) -> np.ndarray:
+    """
+    Return σ and |G − μ| at the steps whose return is known.
+
+    :param episodes: at least one
+    :return: (C, 2, steps)
+    """
+    std = np.concatenate([episode.stds[np.isfinite(episode.returns)] for episode in episodes])
+    error = np.concatenate([np.abs(episode.overestimation[np.isfinite(episode.returns)]) for episode in episodes])
+    return np.stack([std.T, error.T], axis=1)
 
 
 class Recording:

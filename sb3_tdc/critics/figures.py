@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 
 from sb3_tdc.common.plots import import_figure, style_axes
 from sb3_tdc.common.returns import TOLERANCE
-from sb3_tdc.critics.episodes import Episode, summarise
+from sb3_tdc.critics.episodes import Episode, rank_correlation, spread_and_error, summarise
 from sb3_tdc.tdc import TDC
+from sb3_tdc.tdc.lam import critical_lam
 from sb3_tdc.tdc.quantiles import quantile_midpoints
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -83,15 +85,46 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
         axes.legend(frameon=False, fontsize="small")
 
 
-def make_figure(episodes: Sequence[Episode], title: str, note: str = "") -> Any:
+def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
+    """|G − μ| against σ at every step, and the mean of tenths of the steps: does σ mean uncertainty?"""
+    known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
+    for critic, (std, error) in enumerate(spread_and_error(known) if known else ()):
+        color = _COLORS[critic % len(_COLORS)]
+        axes.plot(std, error, ".", ms=1.5, color=color, alpha=0.3)
+        tenths = np.array_split(np.argsort(std), 10) if len(std) >= 10 else []
+        label = f"critic {critic + 1}, rank correlation {rank_correlation(std, error):+.2f}"
+        means = np.array([(std[tenth].mean(), error[tenth].mean()) for tenth in tenths]).reshape(-1, 2)
+        axes.plot(*means.T, _STYLES[critic % 2], color=color, lw=1.8, label=label)
+    title = f"Does σ mean uncertainty? {_count(known)}"
+    style_axes(axes, title, "σ of the predicted return", "|realised − predicted mean|")
+    if known:
+        axes.legend(frameon=False, fontsize="small")
+
+
+def draw_lam(axes: Any, episodes: Sequence[Episode], lam: float) -> None:
+    """The share of steps at which a λ selects another critic than λ = 0 does, against that λ."""
+    pairs = [th.as_tensor(np.concatenate([getattr(e, name) for e in episodes])) for name in ("means", "stds")]
+    thresholds = critical_lam(*pairs).numpy()
+    grid = np.linspace(0, max(2.0, 1.5 * lam), 200)
+    axes.plot(grid, (thresholds[:, None] < grid).mean(axis=0), color="black", lw=1.5)
+    axes.axhline(np.isfinite(thresholds).mean(), color="grey", ls=":", lw=1)
+    share = (thresholds < lam).mean()
+    axes.axvline(lam, color=_COLORS[1], lw=1.2, label=f"λ = {lam:g}: {share:.0%}")
+    style_axes(axes, f"What λ changes, {_count(episodes)}", "λ", "steps with another choice than λ = 0")
+    axes.set(xlim=(0, grid[-1]), ylim=(-0.02, 1.02))
+    axes.legend(frameon=False, fontsize="small")
+
+
+def make_figure(episodes: Sequence[Episode], title: str, lam: float, note: str = "") -> Any:
     """
     All of the above on one page.
 
+    :param lam: the model's λ now
     :return: a figure of matplotlib
     :raises ImportError: with the command that installs it
     """
     n_critics = episodes[0].quantiles.shape[1]
-    rows = -(-(n_critics + 3) // 2)
+    rows = -(-(n_critics + 6) // 2)
     figure = import_figure()(figsize=(11, 3.2 * rows + 0.6), layout="constrained")
     axes = list(figure.subplots(rows, 2, squeeze=False).ravel())
     for critic in range(n_critics):
@@ -99,7 +132,9 @@ def make_figure(episodes: Sequence[Episode], title: str, note: str = "") -> Any:
     draw_selection(axes[n_critics], episodes[0])
     draw_calibration(axes[n_critics + 1], episodes)
     draw_overestimation(axes[n_critics + 2], episodes)
-    for unused in axes[n_critics + 3 :]:
+    draw_spread(axes[n_critics + 3], episodes)
+    draw_lam(axes[n_critics + 4], episodes, lam)
+    for unused in axes[n_critics + 5 :]:
         unused.axis("off")
         unused.text(0, 0.95, note, va="top", fontsize="small").set_in_layout(False)
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
@@ -132,7 +167,7 @@ def describe_play(model: TDC) -> str:
 
 def write_explanation(model: TDC, episodes: Sequence[Episode], stem: Path, title: str) -> None:
     """Write the figure as PNG and PDF, and print what it shows in numbers."""
-    figure = make_figure(episodes, title, describe_play(model))
+    figure = make_figure(episodes, title, model.scheduled("lam"), describe_play(model))
     for suffix in (".png", ".pdf"):
         figure.savefig(f"{stem}{suffix}", dpi=150)
     for name, value in summarise(episodes).items():

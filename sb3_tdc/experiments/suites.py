@@ -71,10 +71,15 @@ EVIDENCE: dict[str, list[Cell]] = {
         ("tdc", {"learning_rate": 3e-4, "qf_learning_rate": 3e-4}),
     ),
 }
-# What λ does, and whether it should tune itself
+# What λ does, whether it should tune itself, and what else could be
 LAMBDA: dict[str, list[Cell]] = {
     "lambda": _shorter(
-        100_000, ("Hopper-v4", "HalfCheetah-v4"), *(("tdc", {"lam": lam}) for lam in (0.0, 0.5, 1.0, "auto"))
+        100_000,
+        ("Hopper-v4", "HalfCheetah-v4"),
+        *(("tdc", {"lam": lam}) for lam in (0.0, 0.5, 1.0, "auto")),
+        ("tdc-shift", {"lam": 1.0}),
+        ("tdc-pessimism", {"lam": "auto_0.0"}),
+        ("tdc-kappa", {"lam": 1.0}),
     )
 }
 SUITES = {**PAPER, **EVIDENCE, **LAMBDA}

@@ -87,12 +87,12 @@ def initial_lam(lam: str) -> float:
     )
 
 
-def calibrate(lam: float, scale: float, errors: np.ndarray, n_steps: int) -> tuple[float, float]:
+def calibrate(lam: float, scale: float, errors: np.ndarray, n_steps: int, least: float = 0.0) -> tuple[float, float]:
     """
     Move λ towards values that are right on average: up after underestimation, down after overestimation.
 
-    λ ← clip(λ + η·w·mean(G − Q₁)/scale, 0, λ_max), where scale is a moving average of |G − Q₁| and w = n/1,000, so that
-    neither the scale of rewards nor the length of episodes matters.
+    λ ← clip(λ + η·w·mean(G − Q₁)/scale, least, λ_max), where scale is a moving average of |G − Q₁| and w = n/1,000, so
+    that neither the scale of rewards nor the length of episodes matters.
 
     :param lam: λ
     :param scale: 0 before the first episode
@@ -104,7 +104,7 @@ def calibrate(lam: float, scale: float, errors: np.ndarray, n_steps: int) -> tup
     share = 1 - (1 - SCALE_WEIGHT) ** weight
     scale = scale + share * (size - scale) if scale > 0 else size
     step = RATE * weight * float(errors.mean()) / scale if scale > 0 else 0.0
-    return float(np.clip(lam + step, 0.0, MAX_LAM)), scale
+    return float(np.clip(lam + step, least, MAX_LAM)), scale
 
 
 class PendingEpisode:

@@ -113,6 +113,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         "MultiInputPolicy": MultiInputPolicy,
     }
     schedules: ClassVar[tuple[str, ...]] = ("lam", "learning_rate", "qf_learning_rate")
+    least_lam: ClassVar[float] = 0.0  # of a calibration
     saved_fields: ClassVar[dict[str, SavedField]] = {
         "lam": SavedField(_lam_field),
         "_lam_value": SavedField(or_none(number(0.0)), is_required=False),
@@ -268,8 +269,12 @@ class TDC(CheckedOffPolicyAlgorithm):
         if name == "qf_learning_rate" and self.qf_learning_rate is None:
             name = "learning_rate"
         if name == "lam" and isinstance(self.lam, str):
-            return initial_lam(self.lam) if self._lam_value is None else self._lam_value
+            return max(self._calibrated_lam, 0.0)
         return super().scheduled(name, progress_remaining)
+
+    @property
+    def _calibrated_lam(self) -> float:
+        return initial_lam(self.lam) if self._lam_value is None else self._lam_value  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -435,12 +440,10 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
         """One step of the critics (Eq. 1–10)."""
-        # n-step returns carry their own discounts
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         with th.no_grad():
             next_actions = self._sample_target_actions(replay_data)
             next_quantiles = self.critic_target(replay_data.next_observations, next_actions)  # Eq. 3
-            target = lcb_target(next_quantiles, replay_data.rewards, replay_data.dones, discounts, lam)  # Eq. 4–7
+            target = self.make_target(next_quantiles, replay_data, lam)
         current_quantiles = self.critic(replay_data.observations, replay_data.actions)
 
         # Only the gradient of the loss (Eq. 8–10) is needed to learn
@@ -448,6 +451,16 @@ class TDC(CheckedOffPolicyAlgorithm):
         self._minimize(current_quantiles, self.critic.optimizer, slope)
         if self.diagnoses_critics:
             self.diagnose_critics(current_quantiles.detach(), target)
+
+    def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
+        """
+        Return the λ-LCB target (Eq. 4–7).
+
+        :param next_quantiles: (B, C, N), of the target critics at (s', ã)
+        """
+        # n-step returns carry their own discounts
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        return lcb_target(next_quantiles, replay_data.rewards, replay_data.dones, discounts, lam)
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
         """One step of the actor (Eq. 11–13), then of the temperature."""
@@ -642,7 +655,8 @@ class TDC(CheckedOffPolicyAlgorithm):
             actions = th.as_tensor(np.stack(episode.actions[: len(returns)]), device=self.device).float().flatten(1)
             values = self.critic.q1_forward(self.policy.obs_to_tensor(stacked)[0], actions)  # type: ignore[arg-type]
         errors = returns - values.squeeze(1).cpu().numpy()
-        self._lam_value, self._lam_scale = calibrate(self.scheduled("lam"), self._lam_scale, errors, n_steps)
+        known = self._calibrated_lam, self._lam_scale
+        self._lam_value, self._lam_scale = calibrate(*known, errors, n_steps, self.least_lam)
         self.diagnose(lam_error=th.as_tensor(errors.mean()), lam_scale=th.as_tensor(self._lam_scale))
 
     # ---------------------------------------------------------------- saving
@@ -711,6 +725,6 @@ _FUSED_METHODS = {
     name: getattr(TDC, name)
     for name in (
         *("train", "update", "update_critics", "update_actor", "update_targets"),
-        *("_sample_target_actions", "_minimize", "predict"),
+        *("_sample_target_actions", "make_target", "_minimize", "predict"),
     )
 }

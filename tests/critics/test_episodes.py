@@ -5,6 +5,7 @@ import csv
 import gymnasium as gym
 import numpy as np
 import pytest
+import scipy.stats
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,10 +15,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_tdc import TDC
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.common import returns
+from sb3_tdc.common.plots import import_figure
 from sb3_tdc.critics import episodes as explain
 from sb3_tdc.critics import figures
 from sb3_tdc.runs.callbacks import critic_evaluation
 from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+from sb3_tdc.tdc.quantiles import select_critic
 
 REWARDS = st.lists(st.floats(-100, 100), min_size=1, max_size=30)
 
@@ -92,6 +95,38 @@ def test_right_quantiles_are_calibrated_and_moved_ones_are_not():
     assert summary(10.0)["overestimation"] - summary(0.0)["overestimation"] == pytest.approx(10)
 
 
+def test_rank_correlation_by_hand():
+    # Ranks 0 1 2 3 and 0 2 1 3: 1 − 6·Σd²/(n(n² − 1)) = 1 − 6·2/60
+    assert explain.rank_correlation(np.array([1.0, 2, 5, 9]), np.array([-3.0, 8, 7, 100])) == pytest.approx(0.8)
+    assert explain.rank_correlation(np.arange(5.0), -np.arange(5.0)) == pytest.approx(-1)
+    assert np.isnan(explain.rank_correlation(np.arange(5.0), np.ones(5)))
+
+
+def test_spread_that_means_uncertainty_and_spread_that_does_not():
+    rng = np.random.default_rng(0)
+    std = rng.uniform(0.5, 5, 4_000)
+    quantiles = std[:, None, None] * np.array([-1.0, 1.0])  # mean 0, population σ = std
+    for error, expected in ((std * rng.normal(size=4_000), 0.5), (rng.normal(size=4_000), 0.0)):
+        episode = explain.Episode(np.arange(4_000), quantiles, np.zeros(4_000, int), error)
+        found = explain.summarise([episode])["std_error_correlation"]
+        assert found == pytest.approx(scipy.stats.spearmanr(std, np.abs(error)).statistic, abs=1e-9)
+        assert found == pytest.approx(expected, abs=0.1)
+
+
+def test_what_lam_changes_is_drawn_as_the_choices_say():
+    pytest.importorskip("matplotlib")
+    rng = np.random.default_rng(0)
+    quantiles = rng.normal(size=(50, 3, 6))
+    episode = explain.Episode(np.arange(50), quantiles, np.zeros(50, int), np.full(50, np.nan))
+    axes = import_figure()().subplots()
+    figures.draw_lam(axes, [episode], lam=0.8)
+    grid, shares = axes.lines[0].get_data()
+    means, stds = th.tensor(episode.means), th.tensor(episode.stds)
+    changed = [(select_critic(means, stds, lam) != means.argmin(dim=1)).double().mean() for lam in grid]
+    np.testing.assert_allclose(shares, changed, atol=1e-9)
+    assert 0 < shares[-1] < 1
+
+
 def test_unknown_returns_do_not_count():
     quantiles = np.zeros((3, 2, 4)) + np.array([[[1.0]], [[2.0]], [[50.0]]])
     episode = explain.Episode(np.arange(3), quantiles, np.zeros(3, int), np.array([0.0, 0.0, np.nan]))
@@ -104,7 +139,7 @@ def test_unknown_returns_do_not_count():
 def test_unknown_returns_can_be_drawn():
     pytest.importorskip("matplotlib")
     unknown = explain.Episode(np.arange(3), np.zeros((3, 2, 4)), np.zeros(3, int), np.full(3, np.nan))
-    figure = figures.make_figure([unknown], "title")
+    figure = figures.make_figure([unknown], "title", lam=1.0)
     assert figures.render(figure).ndim == 3
     (calibration,) = (axes for axes in figure.axes if axes.get_title(loc="left").startswith("Calibration"))
     assert len(calibration.lines) == 1  # the diagonal alone
@@ -162,13 +197,16 @@ def test_a_figure_of_any_number_of_critics():
     pytest.importorskip("matplotlib")
     env = make_env(length=10)
     model = TDC("MlpPolicy", env, policy_kwargs={"net_arch": [8], "n_quantiles": 4, "n_critics": 3})
-    figure = figures.make_figure(explain.record_episodes(model, env, 2), "title", figures.describe_play(model))
+    figure = figures.make_figure(explain.record_episodes(model, env, 2), "title", 1.0, figures.describe_play(model))
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles == [
         *(f"Critic {i}, first episode" for i in (1, 2, 3)),
         "Selected critic, first episode",
         "Calibration, 2 episodes",
         "Overestimation, 2 episodes",
+        "Does σ mean uncertainty? 2 episodes",
+        "What λ changes, 2 episodes",
+        *("", ""),  # the note, and nothing
     ]
     height, width, channels = figures.render(figure).shape
     assert height > 100
@@ -192,7 +230,7 @@ def run(tmp_path_factory):
 def test_evaluations_log_the_critics(run):
     (events,) = run.glob("events.out.tfevents.*")
     accumulator = EventAccumulator(str(events)).Reload()
-    for name in ("overestimation", "calibration_error"):
+    for name in ("overestimation", "calibration_error", "std_error_correlation"):
         assert [event.step for event in accumulator.Scalars(f"eval/{name}")] == [200, 400]
     assert all(0 <= event.value <= 1 for event in accumulator.Scalars("eval/calibration_error"))
     assert [event.step for event in accumulator.Images("eval/critics")] == [200, 400]

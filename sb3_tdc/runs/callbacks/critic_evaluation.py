@@ -21,10 +21,10 @@ class CriticEvaluation(StoppableEvaluation):
     """
     An evaluation that also holds TDC's critics against the returns of its episodes; of other algorithms, just that.
 
-    Logs ``eval/overestimation``, ``eval/calibration_error``, the seconds all this has taken since training began as
-    ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as fits in one percent of the
-    time. Plays no step more, and draws no random number. Where a time limit ends episodes before the discount has
-    faded, there is nothing to log.
+    Logs ``eval/overestimation``, ``eval/calibration_error``, ``eval/std_error_correlation``, the seconds all this has
+    taken since training began as ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as
+    fits in one percent of the time. Plays no step more, and draws no random number. Where a time limit ends episodes
+    before the discount has faded, there is nothing to log.
     """
 
     def _init_callback(self) -> None:
@@ -70,8 +70,9 @@ class CriticEvaluation(StoppableEvaluation):
         has_tensorboard = any(isinstance(writer, TensorBoardOutputFormat) for writer in self.logger.output_formats)
         if not has_tensorboard or self.elapsed + self.seconds_per_figure > _SHARE * seconds:
             return
+        title = f"Evaluation at step {self.num_timesteps:,}"
         try:
-            picture = render(make_figure(episodes, f"Evaluation at step {self.num_timesteps:,}"))
+            picture = render(make_figure(episodes, title, self.model.scheduled("lam")))  # type: ignore[attr-defined]
         except ImportError:  # the numbers are enough
             return
         self.logger.record("eval/critics", Image(picture, "HWC"), exclude=("stdout", "log", "json", "csv"))

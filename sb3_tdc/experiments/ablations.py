@@ -1,0 +1,83 @@
+"""
+Variants of TDC that the experiments compare (docs/lambda.md), and that the package does not offer as options.
+
+Their names begin with that of TDC, whose hyperparameters they have. Only the commands of the experiments know them.
+"""
+
+from typing import ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.saved_fields import SavedField, number, or_none
+from sb3_tdc.tdc import TDC
+from sb3_tdc.tdc.lam import MAX_LAM
+from sb3_tdc.tdc.quantiles import Target
+
+# The weight of the newest measurement in the scale of TD errors: the average is over about 1,000 updates
+_KAPPA_WEIGHT = 0.05
+
+
+class ShiftedTDC(TDC):
+    """The abstract's other reading: the quantiles of the selected critic are moved down by λσ."""
+
+    def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
+        target = super().make_target(next_quantiles, replay_data, lam)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        std = target.std.gather(1, target.selected.unsqueeze(1))
+        shift = (1 - replay_data.dones) * discounts * lam * std
+        return target._replace(quantiles=target.quantiles - shift)
+
+
+class PessimisticTDC(TDC):
+    """
+    Two-sided calibration: where λ = 0 still overestimates, the target is lowered by β·(max μ − min μ).
+
+    One number is calibrated, by the rule of ``lam="auto"`` but for its bounds: above 0 it is λ, below 0 it is −β.
+    """
+
+    saved_fields: ClassVar[dict[str, SavedField]] = {
+        **TDC.saved_fields,
+        "_lam_value": SavedField(or_none(number(-MAX_LAM)), is_required=False),
+    }
+    least_lam: ClassVar[float] = -MAX_LAM
+
+    @property
+    def pessimism(self) -> float:
+        """β"""
+        return max(-self._calibrated_lam, 0.0)
+
+    def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
+        target = super().make_target(next_quantiles, replay_data, lam)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        apart = target.mean.amax(dim=1, keepdim=True) - target.mean.amin(dim=1, keepdim=True)
+        lowered = (1 - replay_data.dones) * discounts * self.pessimism * apart
+        self.diagnose(pessimism=th.as_tensor(self.pessimism))
+        return target._replace(quantiles=target.quantiles - lowered)
+
+
+class ScaledKappaTDC(TDC):
+    """κ follows the scale of the TD errors, a moving average of mean |mean_j y_j − mean_k z_k| at every 50th update."""
+
+    def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
+        super().diagnose_critics(current, target)
+        errors = target.quantiles.mean(dim=1, keepdim=True) - current.mean(dim=2)
+        scale = float(errors.abs().mean())
+        if np.isfinite(scale):
+            self.kappa = self.kappa + _KAPPA_WEIGHT * (scale - self.kappa)
+        self.diagnose(kappa=th.as_tensor(self.kappa))
+
+
+ABLATIONS: dict[str, type[OffPolicyAlgorithm]] = {
+    "tdc-shift": ShiftedTDC,
+    "tdc-pessimism": PessimisticTDC,
+    "tdc-kappa": ScaledKappaTDC,
+}
+
+
+def know_ablations() -> None:
+    """Let the commands of the experiments know the variants by name."""
+    ALGORITHMS.update(ABLATIONS)

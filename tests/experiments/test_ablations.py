@@ -1,0 +1,104 @@
+"""Variants of TDC against float64 transcriptions of what they say."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.experiments.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC, know_ablations
+from sb3_tdc.hyperparams import hyperparams_file
+from sb3_tdc.runs.models import load_model
+from sb3_tdc.tdc import TDC
+from tests.helpers.tdc import BATCH, SMALL, random_batches
+
+
+def make(kind, **kwargs):
+    defaults = {"learning_starts": 5, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
+    return kind("MlpPolicy", "Pendulum-v1", policy_kwargs=SMALL, **{**defaults, **kwargs})
+
+
+def random_batch():
+    ((*transitions, dones, rewards),) = random_batches(1)
+    dones[::2] = 1
+    return ReplayBufferSamples(*transitions, dones, rewards)
+
+
+def targets(model, lam):
+    batch = random_batch()
+    quantiles = 5 * th.randn((BATCH, 2, 7), generator=th.Generator().manual_seed(0))
+    return batch, quantiles.double().numpy(), model.make_target(quantiles, batch, lam).quantiles.numpy()
+
+
+def moments(quantiles, lam):
+    mean, std = quantiles.mean(axis=2), quantiles.std(axis=2)
+    rows, selected = np.arange(len(mean)), (mean - lam * std).argmin(axis=1)
+    return mean, std[rows, selected], quantiles[rows, selected]
+
+
+def test_the_shifted_target_is_lower_by_lam_standard_deviations():
+    batch, quantiles, found = targets(make(ShiftedTDC, gamma=0.9), lam=0.7)
+    _, std, chosen = moments(quantiles, 0.7)
+    rewards, dones = batch.rewards.numpy(), batch.dones.numpy()
+    expected = rewards + 0.9 * (1 - dones) * (chosen - 0.7 * std[:, None])
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("calibrated", "lam", "beta"), [(0.5, 0.5, 0.0), (-0.8, 0.0, 0.8), (None, 0.0, 0.0)])
+def test_below_zero_the_calibrated_number_is_pessimism(calibrated, lam, beta):
+    model = make(PessimisticTDC, lam="auto_0.0", gamma=0.9)
+    model._lam_value = calibrated
+    assert (model.scheduled("lam"), model.pessimism) == (lam, beta)
+    batch, quantiles, found = targets(model, lam)
+    mean, _, chosen = moments(quantiles, lam)
+    chosen = chosen - beta * (mean.max(axis=1) - mean.min(axis=1))[:, None]
+    expected = batch.rewards.numpy() + 0.9 * (1 - batch.dones.numpy()) * chosen
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_overestimation_goes_on_into_pessimism_and_back():
+    model = make(PessimisticTDC, lam="auto_0.0")
+    model.learn(10)
+    for reward, direction in ((-1e3, -1), (1e3, 1)):
+        before = model._calibrated_lam
+        for _ in range(5):
+            follow(model, reward)
+        assert np.sign(model._calibrated_lam - before) == direction
+    assert TDC.least_lam == 0.0
+
+
+def follow(model, reward):
+    """Let an episode of ten steps end by itself."""
+    for i in range(10):
+        action, done = np.zeros((1, 1), np.float32), np.array([i == 9])
+        model._follow_episodes(action, np.array([reward]), done, [{}])
+
+
+def test_kappa_follows_the_td_errors():
+    model = make(ScaledKappaTDC)
+    model.learn(6)
+    before = model.kappa
+    current, batch = th.zeros((BATCH, 2, 7)), random_batch()
+    target = model.make_target(th.full((BATCH, 2, 7), 30.0), batch, 1.0)
+    model.diagnose_critics(current, target)
+    error = np.abs(target.quantiles.numpy().mean(axis=1)).mean()
+    assert model.kappa == pytest.approx(before + 0.05 * (error - before), rel=1e-5)
+    assert model.logger is not None
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_saved_and_opened(name, tmp_path):
+    before = dict(ALGORITHMS)
+    know_ablations()
+    try:
+        lam = "auto_0.0" if name == "tdc-pessimism" else 1.0
+        model = make(ABLATIONS[name], lam=lam)
+        model.learn(60)
+        model.save(tmp_path / "model.zip")
+        opened = load_model(tmp_path / "model.zip", name, None, False, device="cpu")
+        assert type(opened) is ABLATIONS[name]
+        assert opened.kappa == model.kappa
+        assert hyperparams_file(name) == hyperparams_file("tdc")
+    finally:
+        ALGORITHMS.clear()
+        ALGORITHMS.update(before)
