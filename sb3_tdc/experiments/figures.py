@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.plots import style_axes
+from sb3_tdc.experiments.published_curves import PublishedCurve
 from sb3_tdc.experiments.statistics import mean_interval
 
 # Okabe and Ito's colours, which the colour-blind can tell apart
@@ -47,9 +48,17 @@ def count_seeds(n: int, unfinished: int = 0) -> str:
     return f"{text}, {unfinished} unfinished" if unfinished else text
 
 
-def draw_curves(axes: Any, curves: Sequence[Curve], title: str, ylabel: str, log: bool = False) -> None:
+def draw_curves(
+    axes: Any,
+    curves: Sequence[Curve],
+    title: str,
+    ylabel: str,
+    log: bool = False,
+    published: Sequence[PublishedCurve] = (),
+) -> None:
     """
-    Mean over seeds with its 95 % t interval, every seed as a thin line; an unfinished one is dotted.
+    Mean over seeds with its 95 % t interval, every seed as a thin line; an unfinished one is dotted, a published mean
+    is dashed, and shown as far as ours go.
 
     One seed has no interval; that of two can be huge, and runs off the axis, which is made for the seeds. On a
     logarithmic axis, means and intervals are those of the logarithms.
@@ -65,6 +74,13 @@ def draw_curves(axes: Any, curves: Sequence[Curve], title: str, ylabel: str, log
         mean, low, high = (np.exp(v) if log else v for v in mean_interval(values))
         axes.plot(*_finite(curve.steps, mean), color=curve.color, lw=1.8, label=label)
         axes.fill_between(curve.steps, low, high, color=curve.color, alpha=0.15, lw=0)
+    last = max((curve.steps[-1] for curve in curves), default=0)
+    for known in published:
+        mean, low, high = known.interval()
+        here = known.steps <= last
+        label = f"{known.algorithm}, published · {count_seeds(known.seeds)}"
+        axes.plot(known.steps[here], mean[here], "--", color="grey", lw=1.3, label=label)
+        axes.fill_between(known.steps[here], low[here], high[here], color="grey", alpha=0.15, lw=0)
     seeds = np.concatenate([v.ravel() for curve in curves for v in (curve.values, curve.unfinished)])
     axes.set_ylim(*_limits(seeds[np.isfinite(seeds)], log))
     style_axes(axes, title, "environment steps", ylabel)

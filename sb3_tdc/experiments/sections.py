@@ -14,6 +14,7 @@ import pandas as pd
 from sb3_tdc.experiments import figures, provenance, statistics, tables
 from sb3_tdc.experiments.curves import bin_width, headline, make_curve, read_evaluations, read_td_errors
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
+from sb3_tdc.experiments.published_curves import published_curves
 from sb3_tdc.experiments.results import Group, Run, vary
 from sb3_tdc.experiments.suites import ISAAC, MUJOCO, PYBULLET
 
@@ -98,6 +99,7 @@ class Report:
             curves,
             groups[0].env_id,
             f"return of {_and(episodes) or 'no'} mean-action episodes",
+            published=[curve for curve in published_curves(groups[0].env_id) if curve.algorithm == "SAC"],
         )
 
     def learning_curves(self) -> Section:
@@ -106,7 +108,8 @@ class Report:
             "Evaluations of the mean action, in bins of the paper's 20,000 steps, scaled with the length of the runs "
             "but never below the distance of evaluations. Thick: mean over seeds; band: 95 % interval of that mean "
             "(Student's t over seeds); thin: single seeds. One seed has no band. Unfinished runs are dotted and not "
-            "averaged. The band of two seeds is huge, and runs off the axis, which is made for the seeds.",
+            "averaged. The band of two seeds is huge, and runs off the axis, which is made for the seeds. Dashed: SAC "
+            "as the repository of SimbaV2 has published it, with the interval of its seeds.",
         )
         for groups in self.by_env(self.groups).values():
             shown = headline(groups)
@@ -293,6 +296,14 @@ class Report:
         table = tables.make_published_table(self.returns)
         self.write_table("published", table)
         section.tables.append(("", table))
+        at_our_steps = tables.make_published_curves_table(self.groups)
+        if len(at_our_steps):
+            self.write_table("published_curves", at_our_steps)
+            caption = (
+                "Published learning curves at the number of steps of ours, as mean [95 % interval of the mean over "
+                "seeds]. Theirs are from the repository of SimbaV2, of evaluations with MuJoCo before 3.5."
+            )
+            section.tables.append((caption, at_our_steps))
         return section
 
     def missing(self, runs: Sequence[Run], unreadable: Sequence[str]) -> Section:

@@ -47,7 +47,20 @@ def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[np.ndar
     mean = np.divide(np.nansum(values, axis=0), n, out=np.full(n.shape, np.nan), where=n > 0)
     squares = np.nansum((values - mean) ** 2, axis=0)
     variance = np.divide(squares, n - 1, out=np.full(n.shape, np.nan), where=n > 1)
-    half = stats.t.ppf((1 + confidence) / 2, np.maximum(n - 1, 1)) * np.sqrt(variance / np.maximum(n, 1))
+    return interval_of(mean, np.sqrt(variance), n, confidence)
+
+
+def interval_of(
+    mean: np.ndarray, std: np.ndarray, n: np.ndarray | int, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    The same of what is known by its summary.
+
+    :param std: sample standard deviation over the runs; NaN for fewer than two
+    :param n: how many runs there are
+    :return: mean, low, high
+    """
+    half = stats.t.ppf((1 + confidence) / 2, np.maximum(n - 1, 1)) * std / np.sqrt(np.maximum(n, 1))
     return mean, mean - half, mean + half
 
 

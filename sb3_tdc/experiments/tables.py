@@ -11,6 +11,7 @@ import pandas as pd
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
+from sb3_tdc.experiments.published_curves import published_curves
 from sb3_tdc.experiments.results import Group, Run
 
 TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
@@ -134,6 +135,28 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
     names = [re.split("[,:]|-λ", row["Algorithm"])[0] for row in rows]
     order = sorted(range(len(rows)), key=lambda i: names.index(names[i]))  # stable: ours comes first
     return pd.DataFrame([rows[i] for i in order])
+
+
+def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
+    """Ours after their last step, then each published algorithm after as many, by task and number of steps."""
+    rows = []
+    for env_id, steps in sorted({(g.env_id, g.n_timesteps) for g in groups if g.finished}):
+        published = [(curve, *curve.at(steps)) for curve in published_curves(env_id)]
+        if not any(np.isfinite(mean) for _, mean, *_ in published):
+            continue
+        for group in groups:
+            if (group.env_id, group.n_timesteps) == (env_id, steps) and group.finished:
+                final = final_returns(group.finished)
+                returns = _with_interval(*map(float, statistics.mean_interval(final)))
+                rows.append((env_id, f"{steps:,}", f"{group.label}: this report", returns, str(len(final))))
+        for curve, *interval in published:
+            name = f"{curve.algorithm}: published"
+            rows.append((env_id, f"{steps:,}", name, _with_interval(*interval), str(curve.seeds)))
+    return pd.DataFrame(rows, columns=["Environment", "Steps", "Algorithm", "Return", "Seeds"])
+
+
+def _with_interval(mean: float, low: float, high: float) -> str:
+    return number(mean) if np.isnan(low) else f"{number(mean)} [{number(low)}, {number(high)}]"
 
 
 def number(value: float) -> str:

@@ -53,7 +53,7 @@ def test_numbers_to_read():
 def test_published_returns_are_those_of_the_sources(tmp_path):
     make_run(tmp_path, seed=1, returns=((100.0,),))
     table = tables.make_published_table(tables.make_returns_table(read_groups(tmp_path))).set_index("Algorithm")
-    assert len(table) == 13 + 1
+    assert len(table) == 14 + 1
     assert table.index[:2].tolist() == ["TDC: this report", "TDC-λ: the GeZo-SAC paper"]
     assert table.loc["TDC: this report", ["Hopper", "Ant", "Steps", "Seeds"]].tolist() == ["100", "–", "1,000", "1"]
     tianshou = table.loc["SAC: Tianshou's examples/mujoco"]
