@@ -23,6 +23,6 @@ slow:
 	$(PYTHON) -m pytest -q -m ""
 
 docs:
-	$(PYTHON) -m mkdocs build --strict --quiet
+	$(PYTHON) -m mkdocs build --strict  # with --quiet, nothing would be strict
 
 check: lint types test docs
