@@ -5,6 +5,8 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 
 from sb3_tdc.cli import train
 from sb3_tdc.experiments.ablations import know_ablations
@@ -13,9 +15,16 @@ from sb3_tdc.experiments.ablations import know_ablations
 def main(argv: Sequence[str]) -> int:
     """Return the exit status of ``sb3-tdc train``."""
     know_ablations()
+    keep_niceness()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     sys.orig_argv = ["sb3-tdc", "train", *argv]  # what to type to do the same, for the run's command.txt
     return train.main(argv)
+
+
+def keep_niceness() -> None:
+    """Give the niceness of this process to its session, which Linux may schedule as a group of its own (autogroup)."""
+    with suppress(OSError):
+        Path("/proc/self/autogroup").write_text(str(os.nice(0)))
 
 
 def _die_with_parent() -> None:

@@ -74,6 +74,7 @@ def draw_curves(
         mean, low, high = (np.exp(v) if log else v for v in mean_interval(values))
         axes.plot(*_finite(curve.steps, mean), color=curve.color, lw=1.8, label=label)
         axes.fill_between(curve.steps, low, high, color=curve.color, alpha=0.15, lw=0)
+    shown = [v.ravel() for curve in curves for v in (curve.values, curve.unfinished)]
     last = max((curve.steps[-1] for curve in curves), default=0)
     for known in published:
         mean, low, high = known.interval()
@@ -81,8 +82,9 @@ def draw_curves(
         label = f"{known.algorithm}, published · {count_seeds(known.seeds)}"
         axes.plot(known.steps[here], mean[here], "--", color="grey", lw=1.3, label=label)
         axes.fill_between(known.steps[here], low[here], high[here], color="grey", alpha=0.15, lw=0)
-    seeds = np.concatenate([v.ravel() for curve in curves for v in (curve.values, curve.unfinished)])
-    axes.set_ylim(*_limits(seeds[np.isfinite(seeds)], log))
+        shown.append(mean[here])
+    values = np.concatenate(shown)
+    axes.set_ylim(*_limits(values[np.isfinite(values)], log))
     style_axes(axes, title, "environment steps", ylabel)
     axes.xaxis.set_major_formatter(_short_number)
     axes.legend(frameon=False, fontsize="small")

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -192,3 +193,12 @@ def test_a_matrix_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
     assert len(alone) == len(killed) == 2
     for one, other in zip(alone, killed, strict=True):
         assert fingerprint(one) == fingerprint(other)
+
+
+@pytest.mark.skipif(not Path("/proc/self/autogroup").exists(), reason="Linux without groups of sessions")
+def test_a_run_keeps_the_niceness_of_the_matrix():
+    """It has a session of its own, which would otherwise be scheduled as if it were not nice at all."""
+    code = "import os; os.nice(7); from sb3_tdc.cli import job; job.keep_niceness()"
+    code += "; print(open('/proc/self/autogroup').read())"
+    done = subprocess.run([sys.executable, "-c", code], start_new_session=True, capture_output=True, text=True)
+    assert done.stdout.strip().endswith("nice 7")
