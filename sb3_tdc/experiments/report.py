@@ -59,6 +59,7 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
         report.lambda_sweep(),
         report.heads(),
         report.td_errors(),
+        report.claims(),
         report.published(),
         report.missing(runs, unreadable),
     ]

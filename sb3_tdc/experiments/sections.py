@@ -306,6 +306,20 @@ class Report:
             section.tables.append((caption, at_our_steps))
         return section
 
+    def claims(self) -> Section:
+        section = Section(
+            "The paper's claims",
+            "What the paper says, against the runs that are here, on every task and number of steps. A verdict needs "
+            "95 % intervals over seeds that do not overlap (Student's t for means, χ² for standard deviations); heads "
+            "are interchangeable if their intervals lie within a tenth of each other. Everything else is undecided, "
+            "and one seed decides nothing.",
+        )
+        table = tables.make_claims_table(self.groups)
+        if len(table):
+            self.write_table("claims", table)
+            section.tables.append(("", table))
+        return section
+
     def missing(self, runs: Sequence[Run], unreadable: Sequence[str]) -> Section:
         section = Section(
             "What is here, and what is missing",

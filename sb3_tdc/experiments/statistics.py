@@ -103,6 +103,21 @@ def spread(values: np.ndarray) -> float:
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
+def spread_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
+    """
+    Return the confidence interval of the standard deviation, by χ²: of normal values.
+
+    :param values: (runs,)
+    :return: low, high; NaN for fewer than two
+    """
+    n = len(values)
+    if n < 2:
+        return float("nan"), float("nan")
+    tails = stats.chi2.ppf([(1 + confidence) / 2, (1 - confidence) / 2], n - 1)
+    low, high = np.sqrt((n - 1) / tails) * spread(values)
+    return float(low), float(high)
+
+
 def interquartile_mean(*tasks: np.ndarray, axis: int = -1) -> np.ndarray:
     """
     Mean of the middle half of the scores of all runs on all tasks; of fewer than four scores, that of all.

@@ -10,6 +10,7 @@ import pandas as pd
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.experiments import statistics
+from sb3_tdc.experiments.claims import Interval, examine
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
 from sb3_tdc.experiments.published_curves import published_curves
 from sb3_tdc.experiments.results import Group, Run
@@ -157,6 +158,27 @@ def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 def _with_interval(mean: float, low: float, high: float) -> str:
     return number(mean) if np.isnan(low) else f"{number(mean)} [{number(low)}, {number(high)}]"
+
+
+def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
+    """One row for each comparison that a claim of the paper asks for, with its verdict."""
+    rows = [
+        {
+            "Claim": claim.says,
+            "Environment": claim.env_id,
+            "Steps": f"{claim.n_timesteps:,}",
+            "Compared": claim.what,
+            "Ours": f"{claim.sides[0]}: {_of_seeds(claim.ours)}",
+            "Other": f"{claim.sides[1]}: {_of_seeds(claim.other)}",
+            "Verdict": claim.verdict,
+        }
+        for claim in examine(groups)
+    ]
+    return pd.DataFrame(rows)
+
+
+def _of_seeds(interval: Interval) -> str:
+    return f"{_with_interval(interval.value, interval.low, interval.high)} ({interval.n} seed{'s' * (interval.n != 1)})"
 
 
 def number(value: float) -> str:
