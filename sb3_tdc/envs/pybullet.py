@@ -5,7 +5,7 @@ import importlib
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import gymnasium as gym
@@ -42,20 +42,25 @@ def make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Drop what C code prints: PyBullet announces itself at its import and at every connection."""
-    libc = ctypes.CDLL(None)
-    sys.stdout.flush()
-    libc.fflush(None)
-    kept, nothing = {fd: os.dup(fd) for fd in (1, 2)}, os.open(os.devnull, os.O_WRONLY)
-    for fd in kept:
-        os.dup2(nothing, fd)
-    try:
+    with ExitStack() as stack:
+        if os.name == "posix":
+            libc = ctypes.CDLL(None)
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            libc.fflush(None)
+            for fd in (1, 2):
+                _drop_output(fd, stack)
+            stack.callback(libc.fflush, None)
         yield
-    finally:
-        libc.fflush(None)
-        for fd, copy in kept.items():
-            os.dup2(copy, fd)
-            os.close(copy)
+
+
+def _drop_output(fd: int, stack: ExitStack) -> None:
+    with suppress(OSError):  # closed: there is nothing to drop
+        kept, nothing = os.dup(fd), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, fd)
         os.close(nothing)
+        stack.callback(os.close, kept)
+        stack.callback(os.dup2, kept, fd)
 
 
 PYBULLET = Simulator(provides=lambda env_id: "BulletEnv-" in env_id, register=register, make=make)

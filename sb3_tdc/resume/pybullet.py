@@ -16,12 +16,11 @@ def capture_world(client: Any) -> dict[str, Any]:
     """
     Positions, velocities, contacts with the impulses from which the solver starts; and what bodies there are.
 
-    :raises NotCapturedError: if a free body has no joints: resumed from PyBullet's file, it moves differently
+    :raises NotCapturedError: if several bodies move: from PyBullet's file, contacts between them continue differently
     """
-    for number in range(client.getNumBodies()):
-        if client.getNumJoints(number) == 0 and client.getDynamicsInfo(number, -1)[0] > 0:
-            name = client.getBodyInfo(number)[1].decode()
-            raise NotCapturedError(f"PyBullet does not save all of {name!r}, a free body without joints")
+    moving = [n for n in range(client.getNumBodies()) if _moves(client, n)]
+    if len(moving) > 1:
+        raise NotCapturedError(f"PyBullet does not save all of a world in which {len(moving)} bodies move")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "world.bullet"
         client.saveBullet(str(file))
@@ -41,6 +40,11 @@ def restore_world(existing: Any, state: dict[str, Any]) -> Any:
         file.write_bytes(state["world"])
         existing.restoreState(fileName=str(file))
     return existing
+
+
+def _moves(client: Any, body: int) -> bool:
+    links = range(-1, client.getNumJoints(body))
+    return any(client.getDynamicsInfo(body, link)[0] > 0 for link in links)
 
 
 def _bodies(client: Any) -> list[str]:

@@ -164,7 +164,17 @@ OTHERS = {
         wrapper_class=lambda env: gym.wrappers.NormalizeReward(gym.wrappers.DelayObservation(env, 2)),
     ),
 }
-BULLET = ("HalfCheetah", "Hopper", "Ant", "Humanoid", "Walker2D", "InvertedDoublePendulum", "Reacher")
+BULLET = (
+    "HalfCheetah",
+    "Hopper",
+    "Ant",
+    "Humanoid",
+    "Walker2D",
+    "InvertedPendulum",
+    "InvertedDoublePendulum",
+    "Reacher",
+    "Pusher",
+)
 PYBULLET = {
     f"{name}BulletEnv-{n_envs}": Case(
         bullet(f"{name}BulletEnv-v0"), n_envs=n_envs, vec_env=vec_env, wrapper_class=wrapper_class
