@@ -23,7 +23,7 @@ def main(argv: Sequence[str]) -> int:
 
 def keep_niceness() -> None:
     """Give the niceness of this process to its session, which Linux may schedule as a group of its own (autogroup)."""
-    with suppress(OSError):
+    with suppress(OSError, AttributeError):  # no such file, or no niceness: another system
         Path("/proc/self/autogroup").write_text(str(os.nice(0)))
 
 

@@ -13,22 +13,26 @@ class NormalNoiseRange(NormalActionNoise):
     """
     Gaussian noise that is small in the first environment and large in the last, evenly spaced between (as in FastTD3).
 
+    By itself, and so in a single environment, it has the size in the middle.
+
     :param mean: (n_actions,)
-    :param sigma: (n_actions,), the standard deviation in the first environment
+    :param smallest: (n_actions,), the standard deviation in the first environment
     :param largest: the same in the last
     """
 
-    def __init__(self, mean: np.ndarray, sigma: np.ndarray, largest: np.ndarray):
-        super().__init__(mean, sigma)
-        self.largest = largest
+    def __init__(self, mean: np.ndarray, smallest: np.ndarray, largest: np.ndarray):
+        super().__init__(mean, (smallest + largest) / 2)
+        self.smallest, self.largest = smallest, largest
 
     def __repr__(self) -> str:
-        return f"NormalNoiseRange(mu={self._mu}, sigma={self._sigma} to {self.largest})"
+        return f"NormalNoiseRange(mu={self._mu}, sigma={self.smallest} to {self.largest})"
 
 
 class VectorizedNormalNoise(VectorizedActionNoise):
     """
     SB3's ``VectorizedActionNoise`` of Gaussian noise with one draw for all environments: the same numbers, sooner.
+
+    ``mean`` and ``sigma``, (n_envs, *actions), may be changed in place.
 
     :param base_noise: of one environment
     :param n_envs: how many there are
@@ -37,9 +41,9 @@ class VectorizedNormalNoise(VectorizedActionNoise):
     def __init__(self, base_noise: NormalActionNoise, n_envs: int):
         self.n_envs = int(check_number("n_envs", n_envs, 1))
         self.base_noise = base_noise
-        self.mean = np.stack([base_noise._mu] * self.n_envs)
-        largest = getattr(base_noise, "largest", base_noise._sigma)
-        self.sigma = np.linspace(base_noise._sigma, largest, self.n_envs)  # (n_envs, *actions)
+        ends = [getattr(base_noise, name, base_noise._sigma) for name in ("smallest", "largest")]
+        mean, smallest, largest = np.broadcast_arrays(base_noise._mu, *ends)
+        self.mean, self.sigma = np.stack([mean] * self.n_envs), np.linspace(smallest, largest, self.n_envs)
 
     def __call__(self) -> np.ndarray:
         dtype: Any = self.base_noise._dtype  # type: ignore[attr-defined]
@@ -50,7 +54,7 @@ class VectorizedNormalNoise(VectorizedActionNoise):
 
     @property  # type: ignore[misc]
     def noises(self) -> tuple[NormalActionNoise, ...]:  # type: ignore[override]
-        """The noise of every environment; changes of its arrays in place take effect."""
+        """The noise of every environment, of views of ``mean`` and ``sigma``."""
         return tuple(NormalActionNoise(mean, sigma) for mean, sigma in zip(self.mean, self.sigma, strict=True))
 
     def __repr__(self) -> str:
@@ -58,16 +62,10 @@ class VectorizedNormalNoise(VectorizedActionNoise):
 
 
 def noise_of_all(noise: ActionNoise, n_envs: int) -> ActionNoise:
-    """
-    Return the noise of several environments, made of that of one.
-
-    :raises ValueError: for a range of sizes and one environment
-    """
+    """Return the noise of several environments, made of that of one."""
     if n_envs > 1:
         # A subclass may draw otherwise
         if isinstance(noise, NormalActionNoise) and type(noise) in (NormalActionNoise, NormalNoiseRange):
             return VectorizedNormalNoise(noise, n_envs)
         return VectorizedActionNoise(noise, n_envs)
-    if isinstance(noise, NormalNoiseRange):
-        raise ValueError("noise_std from one value to another needs several environments: n_envs is 1")
     return noise

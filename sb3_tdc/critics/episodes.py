@@ -72,7 +72,7 @@ class Episode:
 
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     """
-    Return Spearman's rank correlation, of numbers without ties.
+    Return Spearman's rank correlation.
 
     :param x: (T,)
     :param y: (T,)
@@ -80,9 +80,14 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     """
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return float("nan")
-    ranks = np.stack([np.argsort(np.argsort(values)) for values in (x, y)])
-    matrix: Any = np.corrcoef(ranks)
+    matrix: Any = np.corrcoef(np.stack([_ranks(x), _ranks(y)]))
     return float(matrix[0, 1])
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """Return ranks; equal values have the mean of theirs."""
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(counts) - (counts - 1) / 2)[places]
 
 
 def summarise(episodes: Sequence[Episode]) -> dict[str, float]:

@@ -135,9 +135,10 @@ def make_figure(episodes: Sequence[Episode], title: str, lam: float, note: str =
     draw_overestimation(axes[n_critics + 2], episodes)
     draw_spread(axes[n_critics + 3], episodes)
     draw_lam(axes[n_critics + 4], episodes, lam)
-    for unused in axes[n_critics + 5 :]:
-        unused.axis("off")
-        unused.text(0, 0.95, note, va="top", fontsize="small").set_in_layout(False)
+    unused = axes[n_critics + 5 :]
+    for empty in unused:
+        empty.axis("off")
+    unused[0].text(0, 0.95, note, va="top", fontsize="small").set_in_layout(False)
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
     return figure
 

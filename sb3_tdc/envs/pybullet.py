@@ -4,6 +4,7 @@ import ctypes
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
@@ -41,8 +42,8 @@ def make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Drop what C code prints: PyBullet announces itself at its import and at every connection."""
-    with ExitStack() as stack:
+    """Drop what C code prints: PyBullet announces itself at its import and at every connection. Warnings come later."""
+    with warnings.catch_warnings(record=True) as caught, ExitStack() as stack:
         if os.name == "posix":
             libc = ctypes.CDLL(None)
             if sys.stdout is not None:
@@ -52,6 +53,8 @@ def _quiet() -> Iterator[None]:
                 _drop_output(fd, stack)
             stack.callback(libc.fflush, None)
         yield
+    for each in caught:
+        warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
 
 
 def _drop_output(fd: int, stack: ExitStack) -> None:

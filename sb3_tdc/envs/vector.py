@@ -173,7 +173,8 @@ def split_infos(infos: dict[str, Any], n_envs: int) -> list[dict[str, Any]]:
     """
     Return the info of every environment.
 
-    :param infos: of all: arrays by name, each with a mask ``_name`` of the environments that have it
+    :param infos: of all: arrays by name, each with a mask ``_name`` of the environments that have it; what is not of as
+        many parts as there are environments is every environment's
     """
     split: list[dict[str, Any]] = [{} for _ in range(n_envs)]
     names = [name for name in infos if not (name.startswith("_") and name[1:] in infos)]
@@ -182,8 +183,10 @@ def split_infos(infos: dict[str, Any], n_envs: int) -> list[dict[str, Any]]:
         values = infos[name]
         parts: Any = split_infos(values, n_envs) if isinstance(values, dict) else values
         parts = to_numpy(parts) if hasattr(parts, "detach") else parts
+        # One value, a log for instance
+        is_of_all = isinstance(parts, str) or not hasattr(parts, "__len__") or len(parts) != n_envs
         for i in map(int, np.flatnonzero(mask)):
-            split[i][name] = parts[i]
+            split[i][name] = parts if is_of_all else parts[i]
     return split
 
 

@@ -45,6 +45,11 @@ class PessimisticTDC(TDC):
     }
     least_lam: ClassVar[float] = -MAX_LAM
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if not isinstance(self.lam, str):
+            raise ValueError(f'lam must be calibrated here: "auto", or "auto_" and a number, got {self.lam!r}')
+
     @property
     def pessimism(self) -> float:
         """β"""

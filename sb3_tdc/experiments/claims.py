@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.results import Group, Run, vary
+from sb3_tdc.experiments.results import Group, Run, differences, vary
 
 RIVALS = ("td3", "sac", "meow")
 # The part of a run that is late in training; a TD error's variance is looked at over the same part
 _LATE = 1 / 3
-# Heads whose intervals lie within this share of the larger mean of each other are interchangeable
+# Heads are interchangeable if they differ by at most this share of the larger mean
 _SAME = 0.1
 
 
@@ -78,11 +78,10 @@ def judge_same(ours: Interval, other: Interval) -> str:
     """Return the verdict on the claim that both are the same, within a tenth of the larger mean."""
     if not (ours.is_known and other.is_known):
         return "undecided: too few seeds"
-    if ours.is_above(other) or other.is_above(ours):
-        return "not held"
     margin = _SAME * max(abs(ours.value), abs(other.value))
+    nearest = max(ours.low - other.high, other.low - ours.high)
     farthest = max(ours.high - other.low, other.high - ours.low)
-    return "held" if farthest <= margin else "undecided"
+    return "held" if farthest <= margin else "not held" if nearest > margin else "undecided"
 
 
 # ---------------------------------------------------------------- quantities
@@ -176,11 +175,18 @@ def _td_errors(groups: Sequence[Group]) -> Iterator[Claim]:
 
 def _rivals(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
     """Pairs of TDC and a rival, both as ``hyperparams/`` has them."""
-    as_shipped = [group for group in groups if group.label == group.algo.upper() and group.finished]
+    as_shipped = [group for group in groups if group.finished and _is_as_shipped(group)]
     for plain in as_shipped:
         for rival in as_shipped if plain.algo == "tdc" else ():
             if rival.algo in RIVALS and _is_as_long(plain, rival):
                 yield plain, rival
+
+
+def _is_as_shipped(group: Group) -> bool:
+    """Return whether a group has the hyperparameters of ``hyperparams/``, but for its length and its warm-up."""
+    differing = differences(group.runs[0])
+    warm_up = differing.pop("learning_starts", None)
+    return not set(differing) - {"n_timesteps", "eval_freq", "mujoco"} and warm_up in (None, group.n_timesteps // 10)
 
 
 def _pairs_of(groups: Sequence[Group], key: str) -> Iterator[tuple[Group, Group]]:

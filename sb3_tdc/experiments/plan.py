@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.checks import suggest
-from sb3_tdc.envs.registry import require_env
+from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.experiments.results import default_settings, find_runs, same_settings
 from sb3_tdc.experiments.suites import Cell
@@ -94,6 +94,8 @@ def _why_missing(cell: Cell) -> str:
     """Return why a cell cannot be run here, or ""."""
     if cell.algo not in ALGORITHMS:
         return f"this version of the package has no {cell.algo.upper()}"
+    if simulator_of(cell.env_id).make_vec is not None:
+        return "it has no evaluations, and a simulation of its own on a GPU: train it by sb3-tdc train"
     try:
         require_env(cell.env_id)
     except ValueError as error:
@@ -128,30 +130,29 @@ def read_rates(logs: Path) -> dict[tuple[str, str], float]:
 
 
 class _Clock(BaseCallback):
-    """Reads the time at two steps."""
-
-    times: dict[int, float]
+    """Reads step and time from a step on."""
 
     def _on_training_start(self) -> None:
-        self.times = {}
+        self.readings: list[tuple[int, float]] = []
 
     def _on_step(self) -> bool:
-        if self.num_timesteps in (_FIRST, _LAST):
-            self.times[self.num_timesteps] = time.perf_counter()
+        if self.num_timesteps >= _FIRST:
+            self.readings.append((self.num_timesteps, time.perf_counter()))
         return True
 
 
 def measure_rate(job: Job) -> float:
     """Return environment steps per second, with updates, without evaluations; on one thread, over a few hundred."""
     clock = _Clock()
+    n_timesteps = max(_LAST, 10 * job.config.get("n_envs", 1))
     with tempfile.TemporaryDirectory() as folder:
         settings = RunSettings(
             algo=job.algo,
             env=job.env_id,
-            n_timesteps=_LAST,
+            n_timesteps=n_timesteps,
             seed=job.seed,
             log_folder=folder,
-            hyperparams=replace(job, n_timesteps=_LAST).config,
+            hyperparams=replace(job, n_timesteps=n_timesteps).config,
             gym_packages=list(job.packages),
             eval_freq=-1,
             resume_freq=-1,
@@ -163,7 +164,8 @@ def measure_rate(job: Job) -> float:
         run.hyperparams.callbacks.append(lambda: clock)
         if train(run).interrupted:
             raise KeyboardInterrupt
-    return (_LAST - _FIRST) / (clock.times[_LAST] - clock.times[_FIRST])
+    (first, start), (last, end) = clock.readings[0], clock.readings[-1]
+    return (last - first) / (end - start)
 
 
 def dry_run(plan: Plan, rates: Mapping[tuple[str, str], float], n_jobs: int) -> None:

@@ -2,9 +2,10 @@
 
 import inspect
 import json
+import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -61,7 +62,7 @@ class Run:
                 args["algo"],
                 args["env"],
                 args["seed"],
-                _flatten({**config, "n_timesteps": folder.n_timesteps, **changed}),
+                _flatten({**config, "n_timesteps": folder.n_timesteps, **changed, **_simulator(folder.versions)}),
             )
             run.n_timesteps  # noqa: B018  # must be there
         except (OSError, KeyError, TypeError, AttributeError) as error:
@@ -256,7 +257,7 @@ def describe(settings: dict[str, Any]) -> str:
 def _describe(key: str, value: Any) -> str:
     if key == "stochastic_actor":
         return "stochastic head" if value else "deterministic head"
-    name = {"lam": "λ", "n_timesteps": "steps"}.get(key, key.removeprefix("policy_kwargs."))
+    name = {"lam": "λ", "n_timesteps": "steps", "mujoco": "MuJoCo"}.get(key, key.removeprefix("policy_kwargs."))
     if isinstance(value, int) and not isinstance(value, bool):
         return f"{name} {value:,}"
     if value is None:
@@ -271,6 +272,12 @@ def _label(run: Run, representatives: Sequence[Run]) -> str:
     telling = {key for key in keys if len({_canonical(other.setting(key)) for other in alike}) > 1}
     shown = {key: value for key, value in differences(run).items() if key in telling}
     return f"{run.algo.upper()}, {describe(shown)}" if shown else run.algo.upper()
+
+
+def _simulator(versions: Mapping[str, str]) -> dict[str, str]:
+    """Return which MuJoCo a run was made with: its contacts are others since 3.5 (docs/differences.md)."""
+    version = re.match(r"(\d+)\.(\d+)", str(versions.get("mujoco", "")))
+    return {"mujoco": "since 3.5" if tuple(map(int, version.groups())) >= (3, 5) else "before 3.5"} if version else {}
 
 
 def _identity(run: Run, without: str | None = None) -> str:

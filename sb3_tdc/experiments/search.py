@@ -6,7 +6,7 @@ from typing import Any
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
-from sb3_tdc.envs.registry import require_env
+from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job, count_cores
 from sb3_tdc.experiments.search_space import LAMBDAS, make_candidates, parse_space
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
@@ -23,6 +23,8 @@ def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
         value = getattr(args, name)
         if value is not None and value < 1:
             raise ValueError(f"{'-n' if name == 'n_timesteps' else f'--{name}'} must be at least 1, got {value}")
+    if simulator_of(args.env).make_vec is not None:
+        raise ValueError(f"{args.env} has no evaluations by which candidates could be compared")
     require_env(args.env)
     space = parse_space(args.search)
     if not space:

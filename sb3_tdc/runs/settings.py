@@ -82,7 +82,10 @@ class RunSettings:
     n_eval_envs: int = setting(default=1, minimum=1, help="environments for evaluation")
     save_freq: int = setting(default=-1, help="environment steps between saved models (-1: only at the end)")
     save_replay_buffer: bool = setting(default=False, help="save the replay buffer with the model")
-    resume_freq: int = setting(default=DEFAULT_FREQ, help="environment steps between resume states (-1: none)")
+    resume_freq: int | None = setting(
+        default=None,
+        help=f"environment steps between resume states (-1: none; default: {DEFAULT_FREQ:,}, or 100 an environment)",
+    )
     resume: Path | None = setting(
         default=None,
         role=Role.RESUMING,
@@ -116,6 +119,11 @@ class RunSettings:
     verbose: int = setting(
         default=1, role=Role.PROCESS, help="0: silent, 1: progress, 2: also SB3's tables and messages"
     )
+
+    @property
+    def writes_states(self) -> bool:
+        """Whether the run can be resumed."""
+        return self.resume_freq is None or self.resume_freq > 0
 
     def as_plain(self) -> dict[str, Any]:
         """Return the settings as they are written to ``args.yml``."""

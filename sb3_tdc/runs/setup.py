@@ -111,7 +111,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     settings = _resumed_settings(folder, {**given, **_absolute(given)})
     if folder.is_finished:
         return None
-    if settings.resume_freq <= 0:
+    if not settings.writes_states:
         raise ValueError(f"{folder.path} has no resume states: it was made without --resume-freq")
     has_state = bool(stored_steps(folder.resume_folder)) and not settings.start_over
     if folder.has_results and not has_state and not settings.start_over:

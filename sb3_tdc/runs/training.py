@@ -85,8 +85,7 @@ class TrainingRun:
     @property
     def resume_freq(self) -> int:
         """Environment steps between resume states. By default, at most one in 100 steps of all environments."""
-        given = self.settings.resume_freq
-        return max(given, 100 * self.hyperparams.n_envs) if given == DEFAULT_FREQ else given
+        return self.settings.resume_freq or max(DEFAULT_FREQ, 100 * self.hyperparams.n_envs)
 
 
 class NotSavedError(Exception):
@@ -200,7 +199,7 @@ def _save(run: TrainingRun, model: OffPolicyAlgorithm) -> None:
 
 def _open_states(run: TrainingRun) -> ResumeStates | None:
     folder, settings = run.folder, run.settings
-    if settings.resume_freq <= 0:
+    if not settings.writes_states:
         return None
     of_evaluations = [folder.best_model, folder.normalization(folder.best_model)]
     states = ResumeStates(
@@ -360,6 +359,6 @@ def _calls(run: TrainingRun, freq: int) -> int:
 
 def _remedy(run: TrainingRun) -> str:
     """Return what to do to continue on one thread."""
-    if run.settings.resume_freq > 0:
+    if run.settings.writes_states:
         return f"press Ctrl-C, then\n  {run.folder.command_to_resume} --num-threads 1"
     return "press Ctrl-C, and add --num-threads 1 to the command that is printed then."

@@ -159,11 +159,11 @@ def _ornstein_uhlenbeck_noise(call: Call, make: Rebuild) -> OrnsteinUhlenbeckAct
 
 
 def _noise_range(call: Call, make: Rebuild) -> NormalNoiseRange:
-    mean, sigma = _noise_arrays(call, make)
-    largest = _noise_arrays(call, make, "largest")[1]
-    if largest.shape != sigma.shape:
+    mean, smallest = _noise_arrays(call, make, "smallest")
+    _, largest = _noise_arrays(call, make, "largest")
+    if not mean.shape == smallest.shape == largest.shape:
         raise UnsafeFileError("a range of noise without two ends of one shape")
-    return NormalNoiseRange(mean, sigma, largest)
+    return NormalNoiseRange(mean, smallest, largest)
 
 
 def _noise_arrays(call: Call, make: Rebuild, sigma_name: str = "_sigma") -> tuple[np.ndarray, np.ndarray]:

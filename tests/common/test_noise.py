@@ -30,8 +30,17 @@ def test_a_range_is_evenly_spaced_over_the_environments():
     np.random.seed(0)
     drawn = np.stack([noise() for _ in range(20_000)])
     np.testing.assert_allclose(drawn.std(axis=0)[:, 0], [0.1, 0.2, 0.3, 0.4], rtol=0.03)
-    with pytest.raises(ValueError, match="needs several environments: n_envs is 1"):
-        noise_of_all(noise.base_noise, 1)
+    alone = noise_of_all(noise.base_noise, 1)
+    assert np.stack([alone() for _ in range(20_000)]).std() == pytest.approx(0.25, rel=0.03)  # the middle
+
+
+@pytest.mark.parametrize(("mean", "sigma"), [(np.zeros(2), 0.1), (0.0, np.full(2, 0.1))])
+def test_a_number_stands_for_all_actions(mean, sigma):
+    one = NormalActionNoise(mean, sigma)
+    np.random.seed(0)
+    expected = VectorizedActionNoise(one, 4)()
+    np.random.seed(0)
+    np.testing.assert_array_equal(noise_of_all(one, 4)(), expected)
 
 
 def test_a_subclass_that_draws_otherwise_keeps_its_own():

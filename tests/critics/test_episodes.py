@@ -102,6 +102,14 @@ def test_rank_correlation_by_hand():
     assert np.isnan(explain.rank_correlation(np.arange(5.0), np.ones(5)))
 
 
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=3, max_size=30))
+def test_rank_correlation_is_scipy_s(pairs):
+    x, y = np.array(pairs, dtype=float).T  # with many ties
+    found = explain.rank_correlation(x, y)
+    if np.ptp(x) > 0 and np.ptp(y) > 0:
+        assert found == pytest.approx(scipy.stats.spearmanr(x, y).statistic, abs=1e-12)
+
+
 def test_spread_that_means_uncertainty_and_spread_that_does_not():
     rng = np.random.default_rng(0)
     std = rng.uniform(0.5, 5, 4_000)

@@ -204,7 +204,7 @@ def test_an_environment_that_resets_all_or_none_is_refused():
 
 
 def test_infos_are_split_by_hand():
-    infos = {"a": np.array([1, 2]), "_a": np.array([True, False]), "b": {"c": np.array([3.0, 4.0])}, "_own": "xy"}
+    infos = {"a": np.array([1, 2]), "_a": np.array([True, False]), "b": {"c": np.array([3.0, 4.0])}, "_own": ["x", "y"]}
     assert split_infos(infos, 2) == [{"a": 1, "b": {"c": 3}, "_own": "x"}, {"b": {"c": 4}, "_own": "y"}]
 
 
@@ -269,3 +269,10 @@ def test_environments_that_cannot_be_captured_begin_new_episodes(tmp_path):
     first = np.flatnonzero((buffer.observations[: buffer.pos, 0] == 0).all(axis=1))
     ended = buffer.dones[first - 1, 0]  # before every first observation an episode ended, also where it was cut
     assert ended[first > 0].all()
+
+
+def test_an_info_of_all_environments_is_every_environment_s():
+    """As simulators with a log of all their environments return it."""
+    infos = {"log": {"return": 0.5}, "steps": np.array([1, 2, 3]), "name": "abc"}
+    expected = [{"log": {"return": 0.5}, "steps": i, "name": "abc"} for i in (1, 2, 3)]
+    assert split_infos(infos, 3) == expected

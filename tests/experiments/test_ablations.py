@@ -102,3 +102,8 @@ def test_saved_and_opened(name, tmp_path):
     finally:
         ALGORITHMS.clear()
         ALGORITHMS.update(before)
+
+
+def test_pessimism_is_calibrated_or_nothing():
+    with pytest.raises(ValueError, match=r"lam must be calibrated here: .*, got 1.0"):
+        make(PessimisticTDC, lam=1.0)

@@ -9,6 +9,7 @@ from scipy import stats
 from sb3_tdc.experiments import claims, statistics, tables
 from sb3_tdc.experiments.claims import Interval, examine
 from sb3_tdc.experiments.results import find_runs, group_runs
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from tests.helpers.run_folders import make_run
 
 
@@ -16,9 +17,12 @@ def compare(folder):
     return {(c.says[0], c.what.split()[0], *c.sides): c for c in examine(group_runs(find_runs(folder)[0]))}
 
 
-def make_runs(folder, finals, **kwargs):
+def make_runs(folder, finals, algo="tdc", **changed):
+    """Runs with the hyperparameters of ``hyperparams/``, but for what is changed."""
+    shipped, _ = read_entry(hyperparams_file(algo), "Hopper-v4")
+    config = {**shipped, "n_timesteps": 1000, "learning_starts": 100, **changed}
     for seed, final in enumerate(finals, 1):
-        make_run(folder, seed=seed, returns=((0.0, 0.0), (final, final)), **kwargs)
+        make_run(folder, algo, seed=seed, returns=((0.0, 0.0), (final, final)), **config)
 
 
 def test_intervals_that_do_not_overlap_decide():
@@ -36,7 +40,9 @@ def test_intervals_that_do_not_overlap_decide():
     [
         (Interval(101, 99, 103, 3), "held"),  # at most 103 − 98 = 5 apart, and a tenth of 101 is 10.1
         (Interval(105, 95, 115, 3), "undecided"),  # perhaps 17 apart
-        (Interval(120, 110, 130, 3), "not held"),
+        (Interval(120, 110, 130, 3), "undecided"),  # perhaps 8 apart
+        (Interval(101, 100.9, 101.1, 9), "held"),  # another number, but not by a tenth
+        (Interval(150, 140, 160, 3), "not held"),  # at least 38 apart, and a tenth of 150 is 15
         (Interval(101, np.nan, np.nan, 1), "undecided: too few seeds"),
     ],
 )
@@ -69,6 +75,18 @@ def test_final_returns_and_spreads(tmp_path):
     spreads = [c for c in examine(group_runs(find_runs(tmp_path)[0])) if "over seeds" in c.what]
     assert [c.verdict for c in spreads if c.sides[1] == "SAC"] == ["held"]  # 1 [0.5, 6.3] and 500 [260, 3142]
     assert [c.verdict for c in spreads if c.sides[1] == "TD3"] == ["undecided"]
+
+
+def test_what_hyperparams_say_is_what_is_judged(tmp_path):
+    """In a folder of other runs, labels name what differs there, and not what differs from ``hyperparams/``."""
+    make_runs(tmp_path, (50, 51), algo="td3")
+    make_runs(tmp_path, (100, 101), lam=0.0)
+    assert compare(tmp_path) == {}
+    for steps in (1000, 400):  # the labels name the steps
+        of_that_length = {"n_timesteps": steps, "learning_starts": steps // 10, "steps": steps}
+        make_runs(tmp_path / "as_shipped", (100, 101), **of_that_length)
+        make_runs(tmp_path / "as_shipped", (50, 51), algo="td3", **of_that_length)
+    assert len([c for c in compare(tmp_path / "as_shipped").values() if c.says.startswith("1")]) == 2
 
 
 def test_runs_of_another_length_are_not_compared(tmp_path):

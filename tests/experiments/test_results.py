@@ -136,3 +136,11 @@ def test_a_run_of_rl_zoo_with_other_steps_on_its_command_line(tmp_path):
     runs, _ = find_runs(tmp_path)
     assert [(run.n_timesteps, run.is_finished) for run in runs] == [(300, True), (1000, False)]
     assert len(group_runs(runs)) == 2  # another number of steps is another experiment
+
+
+def test_runs_with_other_contacts_are_not_averaged(tmp_path):
+    for seed, mujoco in ((1, "3.4.0"), (2, "4.0.0"), (3, "3.5.1"), (4, "3.2.7")):
+        run = make_run(tmp_path, seed=seed, returns=((1.0,),))
+        (run.path / run.env_name / "versions.yml").write_text(f"mujoco: {mujoco}\n")
+    groups = {group.label: group.seeds for group in group_runs(find_runs(tmp_path)[0])}
+    assert groups == {"TDC, MuJoCo before 3.5": "2 (1, 4)", "TDC, MuJoCo since 3.5": "2 (2, 3)"}
