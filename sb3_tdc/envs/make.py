@@ -1,7 +1,7 @@
 """From an environment id and hyperparameters to vectorised, wrapped, seeded environments."""
 
 import traceback
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +44,8 @@ def make_envs(
     :param training: False: statistics stay as they are and rewards are not normalised
     :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
     """
-    make = _how_to_make(env_id, vec_env)
     kwargs = {**hyperparams.env_kwargs, **(env_kwargs or {})}
-    env = make(env_id, hyperparams, seed, n_envs, kwargs, monitor_folder, vec_env == "subproc")
+    env = _make(_Wanted(env_id, hyperparams, seed, n_envs, kwargs, vec_env, monitor_folder))
     for wrapper in hyperparams.vec_env_wrapper:
         env = wrapper(env)
     if hyperparams.frame_stack is not None:  # before normalising: replay stores what VecNormalize was given
@@ -61,81 +60,68 @@ def make_envs(
     return env
 
 
-def _how_to_make(env_id: str, vec_env: str) -> Callable[..., VecEnv]:
-    if simulator_of(env_id).make_vec is None:
-        return _make_gymnasium if vec_env == "gymnasium" else _make_sb3
-    if vec_env != "dummy":
-        raise ValueError(f"{env_id} steps all environments in one simulation: leave out --vec-env {vec_env}")
-    return _make_at_once
+@dataclass(frozen=True)
+class _Wanted:
+    """The arguments of :func:`make_envs` that single environments depend on."""
+
+    env_id: str
+    hyperparams: Hyperparams
+    seed: int
+    n_envs: int
+    env_kwargs: dict[str, Any]
+    vec_env: str
+    monitor_folder: Path | None
+
+    def require_no_wrappers(self) -> None:
+        if self.hyperparams.env_wrapper:
+            raise ValueError(f"{self.env_id} is vectorised by itself: env_wrapper cannot wrap its single environments")
+
+    def monitored(self, env: VecEnv) -> VecEnv:
+        file = str(self.monitor_folder / "0") if self.monitor_folder is not None else None
+        return VecMonitor(env, file, tuple(self.hyperparams.monitor_kwargs.get("info_keywords", ())))
 
 
-def _make_at_once(
-    env_id: str,
-    hyperparams: Hyperparams,
-    seed: int,
-    n_envs: int,
-    env_kwargs: dict[str, Any],
-    monitor_folder: Path | None,
-    is_subproc: bool,
-) -> VecEnv:
-    make_vec = simulator_of(env_id).make_vec
-    assert make_vec is not None
-    _require_no_wrappers(env_id, hyperparams)
-    return _monitored(make_vec(env_id, n_envs, seed, env_kwargs), hyperparams, monitor_folder)
+def _make(wanted: _Wanted) -> VecEnv:
+    make_vec = simulator_of(wanted.env_id).make_vec
+    if make_vec is None:
+        return _make_gymnasium(wanted) if wanted.vec_env == "gymnasium" else _make_sb3(wanted)
+    if wanted.vec_env != "dummy":
+        raise ValueError(
+            f"{wanted.env_id} steps all environments in one simulation: leave out --vec-env {wanted.vec_env}"
+        )
+    wanted.require_no_wrappers()
+    return wanted.monitored(make_vec(wanted.env_id, wanted.n_envs, wanted.seed, wanted.env_kwargs))
 
 
-def _require_no_wrappers(env_id: str, hyperparams: Hyperparams) -> None:
-    if hyperparams.env_wrapper:
-        raise ValueError(f"{env_id} is vectorised by itself: env_wrapper cannot wrap its single environments")
-
-
-def _monitored(env: VecEnv, hyperparams: Hyperparams, monitor_folder: Path | None) -> VecEnv:
-    file = str(monitor_folder / "0") if monitor_folder is not None else None
-    return VecMonitor(env, file, tuple(hyperparams.monitor_kwargs.get("info_keywords", ())))
-
-
-def _make_sb3(
-    env_id: str,
-    hyperparams: Hyperparams,
-    seed: int,
-    n_envs: int,
-    env_kwargs: dict[str, Any],
-    monitor_folder: Path | None,
-    is_subproc: bool,
-) -> VecEnv:
+def _make_sb3(wanted: _Wanted) -> VecEnv:
+    is_subproc = wanted.vec_env == "subproc"
     return make_vec_env(
-        _maker(env_id, hyperparams, ignores_signals=is_subproc),
-        n_envs=n_envs,
-        seed=seed,
-        monitor_dir=str(monitor_folder) if monitor_folder else None,
-        monitor_kwargs=hyperparams.monitor_kwargs,
-        env_kwargs=env_kwargs,
+        _maker(wanted.env_id, wanted.hyperparams, ignores_signals=is_subproc),
+        n_envs=wanted.n_envs,
+        seed=wanted.seed,
+        monitor_dir=str(wanted.monitor_folder) if wanted.monitor_folder else None,
+        monitor_kwargs=wanted.hyperparams.monitor_kwargs,
+        env_kwargs=wanted.env_kwargs,
         vec_env_cls=CheckedSubprocVecEnv if is_subproc else DummyVecEnv,
         wrapper_class=Restorable if is_subproc else None,
     )
 
 
-def _make_gymnasium(
-    env_id: str,
-    hyperparams: Hyperparams,
-    seed: int,
-    n_envs: int,
-    env_kwargs: dict[str, Any],
-    monitor_folder: Path | None,
-    is_subproc: bool,
-) -> VecEnv:
+def _make_gymnasium(wanted: _Wanted) -> VecEnv:
     """Make the vector environment that is registered for an id, or else single ones stepped in turn."""
-    spec = gym.spec(env_id)
+    if not hasattr(gym.vector, "AutoresetMode"):
+        raise ValueError(f"--vec-env gymnasium needs Gymnasium 1.1 or newer: this is {gym.__version__}")
     print_warnings_once()
-    if spec.vector_entry_point is not None:
-        _require_no_wrappers(env_id, hyperparams)
-        vector = gym.make_vec(env_id, num_envs=n_envs, **env_kwargs)
+    if gym.spec(wanted.env_id).vector_entry_point is not None:
+        wanted.require_no_wrappers()
+        vector = gym.make_vec(wanted.env_id, num_envs=wanted.n_envs, **wanted.env_kwargs)
     else:
-        single = _maker(env_id, hyperparams, ignores_signals=False)
-        vector = gym.vector.SyncVectorEnv([lambda: single(**env_kwargs)] * n_envs, autoreset_mode="SameStep")
+        single = _maker(wanted.env_id, wanted.hyperparams, ignores_signals=False)
+        makers = [lambda: single(**wanted.env_kwargs)] * wanted.n_envs
+        vector = gym.vector.SyncVectorEnv(makers, autoreset_mode="SameStep")
     env = GymnasiumVecEnv(vector)
-    env.seed(seed)
-    return _monitored(env, hyperparams, monitor_folder)
+    env.seed(wanted.seed)
+    return wanted.monitored(env)
 
 
 def _maker(env_id: str, hyperparams: Hyperparams, ignores_signals: bool) -> Any:
