@@ -204,6 +204,7 @@ def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
     :return: the module
     :raises ValueError: if Ray is not installed, or the cluster cannot be reached
     """
+    os.environ.setdefault("RAY_worker_niceness", "0")  # workers, and so runs, are as nice as this process
     ray = import_ray()
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address is None:
