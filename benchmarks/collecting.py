@@ -94,9 +94,7 @@ def cells() -> Iterator[Cell]:
     for n_envs in (1, 16, 256, 1024, 4096):
         steps = max(40, 400 // n_envs)
         for updates in (0, 1):
-            yield Cell(
-                "tensors, 72 observations", lambda n: VecMonitor(GymnasiumVecEnv(Points(n))), n_envs, steps, updates
-            )
+            yield Cell("tensors, 72 observations", make_points, n_envs, steps, updates)
 
 
 class Clock(BaseCallback):

@@ -306,7 +306,7 @@ class TDC(CheckedOffPolicyAlgorithm):
                 noise = NormalActionNoise(np.zeros(shape), np.full(shape, sigma))
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
             noise = noise.base_noise
-        if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise) and n_envs > 1:
+        if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise):
             noise = noise_of_all(noise, n_envs)
         vars(self)["action_noise"] = noise
 
