@@ -13,8 +13,6 @@ from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.results import Group, Run, differences, vary
 
 RIVALS = ("td3", "sac", "meow")
-# The part of a run that is late in training; a TD error's variance is looked at over the same part
-_LATE = 1 / 3
 # Heads are interchangeable if they differ by at most this share of the larger mean
 _SAME = 0.1
 
@@ -110,16 +108,13 @@ def late_td_error_variance(runs: Sequence[Run]) -> Interval:
 
 
 def _std_of_late_evaluations(run: Run) -> float:
-    if run.evaluations is None:
-        return float("nan")
-    means = run.evaluations.returns.mean(axis=1)
-    late = means[run.evaluations.timesteps > (1 - _LATE) * run.n_timesteps]
+    late = run.late_evaluations()
     return float(np.std(late, ddof=1)) if len(late) > 1 else float("nan")
 
 
 def _log_of_late_td_errors(run: Run) -> float:
-    steps, variances = run.progress("time/total_timesteps", "train/td_error_var").T
-    late = variances[(steps > (1 - _LATE) * run.n_timesteps) & (variances > 0)]
+    late = run.late("train/td_error_var")
+    late = late[late > 0]
     return float(np.log10(late).mean()) if len(late) else float("nan")
 
 

@@ -15,21 +15,11 @@ from sb3_tdc.experiments import final_episodes as test_returns
 from sb3_tdc.experiments.results import Run
 
 RESULTS = Path("results")
-
-
 _FILES = ("evaluations.npz", test_returns.FILE)
-
-
 _SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
-
-
 # Rows of the log; more show the same curve
 _ROWS = 150
-
-
 _COLUMNS = ("time/", "train/", "eval/", "rollout/ep_rew_mean")
-
-
 _LEFT_OUT = ("time/fps", "time/episodes", "time/critics_elapsed")
 
 

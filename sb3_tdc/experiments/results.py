@@ -19,6 +19,8 @@ from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
 
+# The part of a run that is late in training
+_LATE = 1 / 3
 # Settings that make another experiment of the same hyperparameters, and their defaults
 _SETTINGS = defaults(Role.EXPERIMENT)
 
@@ -130,6 +132,20 @@ class Run:
             table = pd.DataFrame()
         values = table[list(columns)].dropna().to_numpy() if set(columns) <= set(table) else nothing
         return values[:, 0] if len(columns) == 1 else values
+
+    def late(self, column: str) -> np.ndarray:
+        """Return the values of a column of the log in the last third of the run."""
+        steps, values = self.progress("time/total_timesteps", column).T
+        return values[self._is_late(steps)]
+
+    def late_evaluations(self) -> np.ndarray:
+        """Return the mean of each evaluation in the last third of the run."""
+        if self.evaluations is None:
+            return np.empty(0)
+        return self.evaluations.returns.mean(axis=1)[self._is_late(self.evaluations.timesteps)]
+
+    def _is_late(self, steps: np.ndarray) -> np.ndarray:
+        return steps > (1 - _LATE) * self.n_timesteps
 
     @cached_property
     def system(self) -> str:

@@ -209,6 +209,14 @@ class Report:
                         self.colors["TDC"],
                     )
                 )
+        table = tables.make_lam_table(self.groups)
+        if len(table):
+            self.write_table("lambda", table)
+            caption = (
+                "What λ does, in the last third of the runs: means over seeds ± standard deviation. With λ = 0 nothing "
+                "is changed, by definition. Overestimation is what the critics predict minus the return that follows."
+            )
+            section.tables.append((caption, table))
         return section
 
     def heads(self) -> Section:

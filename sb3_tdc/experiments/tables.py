@@ -156,6 +156,50 @@ def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["Environment", "Steps", "Algorithm", "Return", "Seeds"])
 
 
+# What λ does: a column of the log, its title, and by what it is multiplied to be read
+_LAM_COLUMNS = (
+    ("train/lam", "λ", 1),
+    ("train/lam_changes", "Choices changed, %", 100),
+    ("train/lam_adds_in_std", "Adds to the target, σ", 1),
+    ("eval/overestimation", "Overestimation", 1),
+    ("eval/std_error_correlation", "Correlation of σ and error", 1),
+    ("train/actor_dormant", "Dormant units of the actor, %", 100),
+    ("train/critic_dormant", "of the critics, %", 100),
+)
+
+
+def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
+    """One row for each group that logs what λ does: means over the last third of every run, and over its seeds."""
+    rows = []
+    for group in groups:
+        logged = {title: _late_means(group.finished, column) * unit for column, title, unit in _LAM_COLUMNS}
+        if not np.isfinite(logged["Choices changed, %"]).any():
+            continue
+        rows.append(
+            {
+                "Environment": group.env_id,
+                "Algorithm": group.label,
+                "Steps": number(group.n_timesteps),
+                "Seeds": len(group.finished),
+                **{title: _over_seeds(values) for title, values in logged.items()},
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _late_means(runs: Sequence[Run], column: str) -> np.ndarray:
+    """(runs,), NaN where a run has not logged it"""
+    return np.array([late.mean() if len(late := run.late(column)) else np.nan for run in runs])
+
+
+def _over_seeds(values: np.ndarray) -> str:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return "–"
+    mean, std = f"{known.mean():.3g}", statistics.spread(known)
+    return (mean if np.isnan(std) else f"{mean} ± {std:.2g}").replace("-", "−")
+
+
 def _with_interval(mean: float, low: float, high: float) -> str:
     return number(mean) if np.isnan(low) else f"{number(mean)} [{number(low)}, {number(high)}]"
 

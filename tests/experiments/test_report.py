@@ -42,6 +42,23 @@ def test_table_by_hand(tmp_path):
     assert shown.loc["SAC", "IQM [95 %]"] == "–"
 
 
+def test_what_lam_does_late_in_training(tmp_path):
+    for seed, late in ((1, 0.1), (2, 0.3)):
+        log = {
+            "train/lam_changes": [0.9, 0.9, late],
+            "eval/overestimation": [np.nan, -9.0, -50.0 * seed],
+        }
+        make_run(tmp_path, seed=seed, lam=0.9, log=log)
+    make_run(tmp_path, seed=3, lam=0.9, steps=500, log={"train/lam_changes": [1.0]})  # not finished
+    make_run(tmp_path, seed=1, lam=0.5, log={"train/lam": [0.5]})  # of a version that did not log more
+    make_run(tmp_path, algo="td3", log={"train/critic_loss": [1.0]})
+    (row,) = tables.make_lam_table(read_groups(tmp_path)).to_dict("records")
+    assert (row["Algorithm"], row["Seeds"]) == ("TDC", 2)
+    assert row["Choices changed, %"] == "20 ± 14"  # of 10 and 30
+    assert row["Overestimation"] == "−75 ± 35"
+    assert row["λ"] == "–"
+
+
 def test_numbers_to_read():
     assert tables.number(1234.5) == "1,234"
     assert tables.number(12.34) == "12.3"

@@ -4,6 +4,7 @@ import json
 import zipfile
 
 import numpy as np
+import pandas as pd
 
 from sb3_tdc.runs.folder import RunFolder
 
@@ -19,8 +20,10 @@ HOPPER = {
 }
 
 
-def make_run(folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=(), returns=((1.0, 3.0),), **config):
-    """:param steps: taken; None if no model was saved"""
+def make_run(
+    folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=(), returns=((1.0, 3.0),), log=None, **config
+):
+    """:param steps: taken; None if no model was saved; :param log: columns of progress.csv, at equal distances"""
     run = RunFolder.create(folder, algo, env_id)
     config = {**(HOPPER if algo == "tdc" else {"n_timesteps": 1000}), **config}
     run.write_config(config, {"algo": algo, "env": env_id, "seed": seed, **dict(args)})
@@ -30,4 +33,8 @@ def make_run(folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=()
         with zipfile.ZipFile(run.model, "w") as archive:
             archive.writestr("data", json.dumps({"num_timesteps": steps}))
             archive.writestr("system_info.txt", "- OS: of the test\n- Python: 3\n")
+    if log is not None:
+        table = pd.DataFrame(log)
+        table.insert(0, "time/total_timesteps", np.linspace(0, steps, len(table) + 1)[1:])
+        table.to_csv(run.path / "progress.csv", index=False)
     return run
