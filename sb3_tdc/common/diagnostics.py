@@ -1,6 +1,7 @@
 """Scalars of the training that stay on the device until the logger asks for them."""
 
 import math
+from collections.abc import Mapping
 
 import torch as th
 from stable_baselines3.common.logger import Logger
@@ -21,20 +22,20 @@ class Diagnostics:
     """
 
     def __init__(self) -> None:
-        self._pending: list[tuple[str, int, int, th.Tensor]] = []
+        self._pending: list[tuple[str, int, int, th.Tensor | float]] = []
         self._sums: dict[str, float] = {}
         self._counts: dict[str, int] = {}
         self._last_finite: dict[str, int] = {}
         self._ended: list[str] = []  # means that begin anew with the next value
         self.is_recorded = True
 
-    def add(self, update: int, timestep: int, values: dict[str, th.Tensor]) -> None:
+    def add(self, update: int, timestep: int, values: Mapping[str, th.Tensor | float]) -> None:
         """
         Take scalars of one update.
 
         :param update: count of gradient steps
         :param timestep: count of environment steps
-        :param values: scalar tensors (without gradient) by name
+        :param values: scalars by name: tensors (without gradient) of one device, or numbers
         :raises NonFiniteError: if a pending value turned out to be NaN or infinite
         """
         self._pending += [(name, update, timestep, value) for name, value in values.items()]
@@ -70,8 +71,10 @@ class Diagnostics:
         if not self._pending:
             return
         pending, self._pending = self._pending, []
-        numbers = th.stack([value for *_, value in pending]).tolist()  # the one wait for the device
-        for (name, update, timestep, _), number in zip(pending, numbers, strict=True):
+        tensors = [value for *_, value in pending if isinstance(value, th.Tensor)]
+        fetched = iter(th.stack(tensors).tolist() if tensors else [])  # the one wait for the device
+        for name, update, timestep, value in pending:
+            number = next(fetched) if isinstance(value, th.Tensor) else value
             if not math.isfinite(number):
                 last = self._last_finite.get(name)
                 before = f"it was last seen finite at update {last}" if last is not None else "it was never seen finite"

@@ -81,7 +81,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         super()._setup_model()
         self._diagnostics = Diagnostics()
 
-    def diagnose(self, **values: th.Tensor) -> None:
+    def diagnose(self, **values: th.Tensor | float) -> None:
         """Take scalars of this update into the means of the log; nothing waits for the device."""
         self._diagnostics.add(self._n_updates, self.num_timesteps, values)
 
@@ -108,6 +108,9 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Write log data; the means of the training begin anew."""
         super().dump_logs()
         self._diagnostics.restart()
+
+    def forget_episodes(self) -> None:
+        """Forget what is known of the episodes under way: the environments begin new ones."""
 
     def prepare_to_continue(self) -> None:
         """Make what a model that has been trained for some time has made, when a run is resumed."""
