@@ -66,7 +66,7 @@ _MADE_ANEW = {
 
 
 def read_fields(
-    raw: bytes, custom_objects: dict[str, Any], budget: Budget
+    raw: bytes, custom_objects: dict[str, Any], budget: Budget, algorithm: type[OffPolicyAlgorithm] | None = None
 ) -> tuple[dict[str, Any], type[OffPolicyAlgorithm]]:
     """
     Read the fields of a saved model.
@@ -74,8 +74,9 @@ def read_fields(
     :param raw: the entry ``data``
     :param custom_objects: what to take for fields of the file, which are then not looked at
     :param budget: of the file
-    :return: the fields that are known, each checked, and the algorithm that saved them
-    :raises UnsafeFileError: for any other field, by name
+    :param algorithm: whose fields they are to be; None: those of the algorithm of the file's policy
+    :return: the fields that are known, each checked, and the algorithm
+    :raises UnsafeFileError: for any other field, by name, and for another algorithm's file
     """
     data = parse_data(raw)
     policies = known_policies()
@@ -83,10 +84,13 @@ def read_fields(
     policy_class = custom_objects.get("policy_class")
     if policy_class is None and "policy_class" in data:
         policy_class = _read_field("policy_class", data["policy_class"], OFF_POLICY["policy_class"], make)
-    algorithm = policies.get(policy_class) or nearest_algorithm(policy_class)
-    if algorithm is None:
+    saved_by = policies.get(policy_class) or nearest_algorithm(policy_class)
+    if saved_by is None:
         known = sorted({each.__name__ for each in policies.values()})
         raise UnsafeFileError(f"it has no policy_class of {', '.join(known)}")
+    algorithm = algorithm or saved_by
+    if not issubclass(algorithm, saved_by):
+        raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
     declared = saved_fields(algorithm)
     fields = {}
     for name, value in data.items():

@@ -62,14 +62,11 @@ def load_safely(
                 raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
         given = {**kwargs, **(custom_objects or {})}
         of_the_caller = {name: value for name, value in given.items() if name != "ent_coef"}
-        fields, saved_by = read_fields(entries["data"], of_the_caller, budget)
+        fields, algorithm = read_fields(entries["data"], of_the_caller, budget, algorithm)
         policy_class: Any = fields.get("policy_class")
         new_temperature = "ent_coef" in given and given["ent_coef"] != fields.get("ent_coef")
         fields.update({name: given[name] for name in (*kwargs, "ent_coef") if name in given})
-        if algorithm is not None and not issubclass(algorithm, saved_by):
-            raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
         del fields["policy_class"]
-        algorithm = algorithm or saved_by
         tensors = {}
         for name in (name for name in entries if name.endswith(".pth")):
             with reading(name):
