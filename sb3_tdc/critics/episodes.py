@@ -6,7 +6,7 @@ mean action that is played.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -90,38 +90,52 @@ def _ranks(values: np.ndarray) -> np.ndarray:
     return (np.cumsum(counts) - (counts - 1) / 2)[places]
 
 
+def pool(episodes: Sequence[Episode]) -> Episode:
+    """Return the steps of all episodes whose returns are known, as if they were of one."""
+    known = [np.isfinite(episode.returns) for episode in episodes]
+    names = [field.name for field in fields(Episode)]
+    parts = {n: [getattr(e, n)[k] for e, k in zip(episodes, known, strict=True)] for n in names}
+    return Episode(**{name: np.concatenate(arrays) for name, arrays in parts.items()})
+
+
 def summarise(episodes: Sequence[Episode]) -> dict[str, float]:
     """
-    Summarise episodes in three numbers.
+    Summarise the steps of episodes, each with the same weight: a short episode must not count as a long one.
 
-    :return: ``overestimation`` (mean over steps and critics, in units of the critics' return) and
-        ``calibration_error`` (mean over levels and critics of |observed − nominal|, between 0 and 0.5 or so), every
-        episode with the same weight; ``std_error_correlation``, of σ and |G − μ| by ranks over the steps of all
-        episodes, mean over critics; without episodes of known returns, nothing
+    :return: ``overestimation`` (mean over steps and critics, in units of the critics' return),
+        ``calibration_error`` (mean over levels and critics of |observed − nominal|, between 0 and 0.5 or so),
+        ``std_error_correlation`` and ``std_scatter_correlation``, of σ with the error and with what is left of it
+        without bias (:func:`spread_and_errors`), by ranks, means over critics; nothing where no return is known
     """
-    known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
-    if not known:
+    pooled = pool(episodes)
+    if not len(pooled.returns):
         return {}
-    frequencies = np.mean([episode.frequencies for episode in known], axis=0)
-    levels = quantile_midpoints(frequencies.shape[1]).numpy()
+    levels = quantile_midpoints(pooled.frequencies.shape[1]).numpy()
     summary = {
-        "overestimation": float(np.mean([np.nanmean(episode.overestimation) for episode in known])),
-        "calibration_error": float(np.abs(frequencies - levels).mean()),
+        "overestimation": float(pooled.overestimation.mean()),
+        "calibration_error": float(np.abs(pooled.frequencies - levels).mean()),
     }
-    correlation = np.mean([rank_correlation(*pairs) for pairs in spread_and_error(known)])
-    return summary | ({"std_error_correlation": float(correlation)} if np.isfinite(correlation) else {})
+    std, error, scatter = spread_and_errors(pooled)
+    for name, errors in (("std_error_correlation", error), ("std_scatter_correlation", scatter)):
+        correlation = np.mean([rank_correlation(*pair) for pair in zip(std.T, errors.T, strict=True)])
+        if np.isfinite(correlation):
+            summary[name] = float(correlation)
+    return summary
 
 
-def spread_and_error(episodes: Sequence[Episode]) -> np.ndarray:
+def spread_and_errors(pooled: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return σ and |G − μ| at the steps whose return is known.
+    Return σ, |G − μ|, and |G − a − b·μ| with the line that fits best: the error without a bias that grows with μ.
 
-    :param episodes: at least one
-    :return: (C, 2, steps)
+    A bias can hide what σ says, or look like it. The scatter around the line is what σ is to predict.
+
+    :param pooled: steps of known returns, M of them
+    :return: each (M, C)
     """
-    std = np.concatenate([episode.stds[np.isfinite(episode.returns)] for episode in episodes])
-    error = np.concatenate([np.abs(episode.overestimation[np.isfinite(episode.returns)]) for episode in episodes])
-    return np.stack([std.T, error.T], axis=1)
+    means, returns = pooled.means - pooled.means.mean(axis=0), (pooled.returns - pooled.returns.mean())[:, None]
+    squares = (means**2).sum(axis=0)
+    slope = np.divide((means * returns).sum(axis=0), squares, out=np.zeros_like(squares), where=squares > 0)
+    return pooled.stds, np.abs(pooled.overestimation), np.abs(returns - slope * means)
 
 
 class Recording:
@@ -131,10 +145,13 @@ class Recording:
     :param model: its critics, γ and λ
     :param every: distance of the steps to look at, at least 1; the rewards of all steps count
     :param normalization: what turns the rewards into those that the critics were trained on, if they are not yet
+    :param time_limit: of the task, if play does not go on after it (:func:`~sb3_tdc.common.returns.known_steps`)
     """
 
-    def __init__(self, model: TDC, every: int = 1, normalization: VecNormalize | None = None):
-        self.model, self.every, self.normalization = model, every, normalization
+    def __init__(
+        self, model: TDC, every: int = 1, normalization: VecNormalize | None = None, time_limit: int | None = None
+    ):
+        self.model, self.every, self.normalization, self.time_limit = model, every, normalization, time_limit
         self.start()
 
     def start(self) -> None:
@@ -168,7 +185,7 @@ class Recording:
         if self.normalization is not None:
             rewards = self.normalization.normalize_reward(rewards)  # as they are, if it does not normalise rewards
         returns = discounted_returns(rewards, self.model.gamma)
-        returns[known_steps(n_steps, terminated, self.model.gamma) :] = np.nan
+        returns[known_steps(n_steps, terminated, self.model.gamma, self.time_limit) :] = np.nan
         steps = np.arange(0, n_steps, self.every)
         steps = steps[: np.searchsorted(steps, n_shown)] if n_shown is not None else steps
         quantiles = predict_quantiles(self.model, self.observations[: len(steps)], np.stack(self.actions[: len(steps)]))

@@ -10,7 +10,7 @@ import torch as th
 
 from sb3_tdc.common.plots import import_figure, style_axes
 from sb3_tdc.common.returns import TOLERANCE
-from sb3_tdc.critics.episodes import Episode, rank_correlation, spread_and_error, summarise
+from sb3_tdc.critics.episodes import Episode, pool, rank_correlation, spread_and_errors, summarise
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.lam import critical_lam
 from sb3_tdc.tdc.quantiles import quantile_midpoints
@@ -44,7 +44,7 @@ def draw_selection(axes: Any, episode: Episode) -> None:
 
 
 def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
-    """Observed frequency against nominal level, a thin line for each episode and a thick one for their mean."""
+    """Observed frequency against nominal level, a thin line for each episode and a thick one for all their steps."""
     known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
     axes.plot([0, 1], [0, 1], ":", color="grey", lw=1)
     for critic in range(episodes[0].quantiles.shape[1]):
@@ -55,7 +55,12 @@ def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
             axes.plot(levels, line, color=color, lw=0.6, alpha=0.4)
         if len(lines):
             axes.plot(
-                levels, np.mean(lines, axis=0), _STYLES[critic % 2], color=color, lw=1.8, label=f"critic {critic + 1}"
+                levels,
+                pool(known).frequencies[critic],
+                _STYLES[critic % 2],
+                color=color,
+                lw=1.8,
+                label=f"critic {critic + 1}",
             )
     style_axes(axes, f"Calibration, {_count(known)}", "quantile level", "returns at or below the quantile")
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
@@ -71,15 +76,11 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
         biases = [episode.overestimation[:, critic] for episode in episodes]
         for episode, bias in zip(episodes, biases, strict=True):
             axes.plot(episode.steps, bias, color=color, lw=0.7, alpha=0.5)
-        means = [np.nanmean(bias) for bias in biases if np.isfinite(bias).any()]
-        if means:
-            axes.axhline(
-                np.mean(means),
-                ls=_STYLES[critic % 2],
-                color=color,
-                lw=1.8,
-                label=f"critic {critic + 1}: {np.mean(means):+.3g}",
-            )
+        known = pool(episodes).overestimation[:, critic]
+        if len(known):
+            mean = known.mean()
+            label = f"critic {critic + 1}: {mean:+.3g}"
+            axes.axhline(mean, ls=_STYLES[critic % 2], color=color, lw=1.8, label=label)
     style_axes(axes, f"Overestimation, {_count(episodes)}", "step", "predicted mean − realised")
     if any(np.isfinite(episode.returns).any() for episode in episodes):
         axes.legend(frameon=False, fontsize="small")
@@ -87,15 +88,18 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
 
 def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
     """|G − μ| against σ at every step, and the mean of tenths of the steps: does σ mean uncertainty?"""
-    known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
-    for critic, (std, error) in enumerate(spread_and_error(known) if known else ()):
+    pooled = pool(episodes)
+    known = len(pooled.returns) > 0
+    of_critics = [array.T for array in spread_and_errors(pooled)] if known else [np.empty((0, 0))] * 3
+    for critic, (std, error, scatter) in enumerate(zip(*of_critics, strict=True)):
         color = _COLORS[critic % len(_COLORS)]
         axes.plot(std, error, ".", ms=1.5, color=color, alpha=0.3)
         tenths = np.array_split(np.argsort(std), 10) if len(std) >= 10 else []
-        label = f"critic {critic + 1}, rank correlation {rank_correlation(std, error):+.2f}"
+        correlations = rank_correlation(std, error), rank_correlation(std, scatter)
+        label = "critic {}, rank correlation {:+.2f}, without bias {:+.2f}".format(critic + 1, *correlations)
         means = np.array([(std[tenth].mean(), error[tenth].mean()) for tenth in tenths]).reshape(-1, 2)
         axes.plot(*means.T, _STYLES[critic % 2], color=color, lw=1.8, label=label)
-    title = f"Does σ mean uncertainty? {_count(known)}"
+    title = f"Does σ mean uncertainty? {_count(episodes)}"
     style_axes(axes, title, "σ of the predicted return", "|realised − predicted mean|")
     if known:
         axes.legend(frameon=False, fontsize="small")

@@ -74,6 +74,17 @@ def test_a_truncated_episode_is_known_where_its_tail_weighs_nothing():
     assert returns.known_steps(10, terminated=False, gamma=0.0) == 9
 
 
+def test_near_the_time_limit_no_step_counts_however_the_episode_ends():
+    # 0.5^7 is negligible: of a task with a limit of 10 steps, the first 3 count
+    assert returns.known_steps(10, terminated=False, gamma=0.5, limit=10) == 3
+    assert returns.known_steps(9, terminated=True, gamma=0.5, limit=10) == 3
+    assert returns.known_steps(2, terminated=True, gamma=0.5, limit=10) == 2
+    assert returns.known_steps(5, terminated=True, gamma=0.5, limit=6) == 0
+    assert returns.known_steps(12, terminated=False, gamma=0.5, limit=20) == 5  # cut off by something else
+    assert returns.known_steps(5, terminated=True, gamma=1.0) == 5
+    assert returns.known_steps(5, terminated=True, gamma=1.0, limit=10) == 0
+
+
 def test_observed_frequency_by_hand():
     quantiles = np.array([[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]])
     # 1 lies at or below the second and third, 3 above all of them
@@ -119,6 +130,33 @@ def test_spread_that_means_uncertainty_and_spread_that_does_not():
         found = explain.summarise([episode])["std_error_correlation"]
         assert found == pytest.approx(scipy.stats.spearmanr(std, np.abs(error)).statistic, abs=1e-9)
         assert found == pytest.approx(expected, abs=0.1)
+
+
+def test_a_bias_that_grows_with_the_value_hides_what_spread_means():
+    """σ is the standard deviation of the returns, but the predictions are half of what they should be."""
+    rng = np.random.default_rng(0)
+    mean, std = rng.uniform(10, 100, 4_000), rng.uniform(0.5, 5, 4_000)
+    quantiles = 0.5 * mean[:, None, None] + std[:, None, None] * np.array([-1.0, 1.0])
+    returns = mean + std * rng.normal(size=4_000)
+    episode = explain.Episode(np.arange(4_000), quantiles, np.zeros(4_000, int), returns)
+    _, error, scatter = explain.spread_and_errors(episode)
+    slope, offset = np.polyfit(0.5 * mean, returns, 1)
+    np.testing.assert_allclose(scatter[:, 0], np.abs(returns - offset - slope * 0.5 * mean), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(error[:, 0], np.abs(returns - 0.5 * mean))
+    found = explain.summarise([episode])
+    assert found["std_scatter_correlation"] > 0.4
+    assert found["std_error_correlation"] < 0.2
+
+
+def test_every_step_has_the_same_weight():
+    def episode(length, error):
+        quantiles = np.full((length, 2, 4), 10.0 + error)
+        return explain.Episode(np.arange(length), quantiles, np.zeros(length, int), np.full(length, 10.0))
+
+    found = explain.summarise([episode(10, 5.0), episode(90, -1.0)])
+    assert found["overestimation"] == pytest.approx((10 * 5 - 90) / 100)
+    # Of the levels 1/8, 3/8, 5/8, 7/8, nine tenths of the returns are above all quantiles and a tenth below
+    assert found["calibration_error"] == pytest.approx(np.abs(0.1 - (np.arange(4) + 0.5) / 4).mean())
 
 
 def test_what_lam_changes_is_drawn_as_the_choices_say():
@@ -238,7 +276,7 @@ def run(tmp_path_factory):
 def test_evaluations_log_the_critics(run):
     (events,) = run.glob("events.out.tfevents.*")
     accumulator = EventAccumulator(str(events)).Reload()
-    for name in ("overestimation", "calibration_error", "std_error_correlation"):
+    for name in ("overestimation", "calibration_error", "std_error_correlation", "std_scatter_correlation"):
         assert [event.step for event in accumulator.Scalars(f"eval/{name}")] == [200, 400]
     assert all(0 <= event.value <= 1 for event in accumulator.Scalars("eval/calibration_error"))
     assert [event.step for event in accumulator.Images("eval/critics")] == [200, 400]
@@ -249,10 +287,12 @@ def test_evaluations_log_the_critics(run):
 
 def test_a_figure_waits_until_it_takes_a_hundredth_of_the_time(tmp_path):
     argv = ["-n", 200, "-f", tmp_path, "--eval-freq", 100, "--eval-episodes", 1, "--env", "Hopper-v4", "--verbose", 0]
-    assert train.main([str(a) for a in argv]) == 0
+    assert train.main([str(a) for a in [*argv, "-params", "learning_starts:150"]]) == 0
     (events,) = (tmp_path / "tdc" / "Hopper-v4_1").glob("events.out.tfevents.*")
-    tags = EventAccumulator(str(events)).Reload().Tags()
-    assert "eval/overestimation" in tags["scalars"]
+    accumulator = EventAccumulator(str(events)).Reload()
+    tags = accumulator.Tags()
+    # Of networks that have learned nothing, there is nothing to say
+    assert [event.step for event in accumulator.Scalars("eval/overestimation")] == [200]
     assert tags["images"] == []  # of less than 200 s, not even the first fits
 
 
@@ -264,6 +304,7 @@ def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monke
     env, eval_env = (VecNormalize(make_env(length=12)) for _ in range(2))
     eval_env.training = eval_env.norm_reward = False
     model = make_model(env, gradient_steps=0)
+    model._n_updates = 1
     model.learn(30, callback=critic_evaluation.CriticEvaluation(
         eval_env, StopOnSignal(), n_eval_episodes=2, eval_freq=30, verbose=0, warn=False
     ))  # fmt: skip

@@ -21,10 +21,10 @@ class CriticEvaluation(StoppableEvaluation):
     """
     An evaluation that also holds TDC's critics against the returns of its episodes; of other algorithms, just that.
 
-    Logs ``eval/overestimation``, ``eval/calibration_error``, ``eval/std_error_correlation``, the seconds all this has
-    taken since training began as ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as
-    fits in one percent of the time. Plays no step more, and draws no random number. Where a time limit ends episodes
-    before the discount has faded, there is nothing to log.
+    Logs what :func:`~sb3_tdc.critics.episodes.summarise` returns as ``eval/...``, the seconds all this has taken since
+    training began as ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as fits in one
+    percent of the time. Plays no step more, and draws no random number. Before the first update, and where a time limit
+    ends episodes before the discount has faded, there is nothing to log.
     """
 
     def _init_callback(self) -> None:
@@ -33,10 +33,12 @@ class CriticEvaluation(StoppableEvaluation):
         self.episodes: list[Episode] = []
         self.elapsed = 0.0
         self.seconds_per_figure = _SECONDS_OF_FIRST_FIGURE
+        spec = self.eval_env.get_attr("spec")[0]
+        self.time_limit = spec.max_episode_steps if spec is not None else None
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         super()._log_success_callback(locals_, globals_)
-        if isinstance(self.model, TDC):
+        if isinstance(self.model, TDC) and self.model._n_updates > 0:
             start = time.perf_counter()
             self._record(self.model, locals_)
             self.elapsed += time.perf_counter() - start
@@ -50,7 +52,7 @@ class CriticEvaluation(StoppableEvaluation):
         """
         i, observations = step["i"], step["observations"]
         if i not in self.recordings:
-            self.recordings[i] = Recording(model, _EVERY, model.get_vec_normalize_env())
+            self.recordings[i] = Recording(model, _EVERY, model.get_vec_normalize_env(), self.time_limit)
         observation = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
         self.recordings[i].add(observation, step["actions"][i], float(step["reward"]))
         if not step["done"]:
