@@ -14,10 +14,10 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.saved_fields import SavedField, number, or_none
 from sb3_tdc.tdc import TDC
-from sb3_tdc.tdc.lam import MAX_LAM
+from sb3_tdc.tdc.calibration import MAX_LAM
 from sb3_tdc.tdc.quantiles import Target
 
-# The weight of the newest measurement in the scale of TD errors: the average is over about 1,000 updates
+# The weight of the newest measurement in the size of errors: the average is over about 1,000 updates
 _KAPPA_WEIGHT = 0.05
 
 
@@ -28,8 +28,9 @@ class ShiftedTDC(TDC):
         target = super().make_target(next_quantiles, replay_data, lam)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         std = target.std.gather(1, target.selected.unsqueeze(1))
-        shift = (1 - replay_data.dones) * discounts * lam * std
-        return target._replace(quantiles=target.quantiles - shift)
+        lowered = (1 - replay_data.dones) * discounts * lam * std
+        self.diagnose(lowered=lowered.mean())
+        return target._replace(quantiles=target.quantiles - lowered)
 
 
 class PessimisticTDC(TDC):
@@ -60,20 +61,19 @@ class PessimisticTDC(TDC):
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         apart = target.mean.amax(dim=1, keepdim=True) - target.mean.amin(dim=1, keepdim=True)
         lowered = (1 - replay_data.dones) * discounts * self.pessimism * apart
-        self.diagnose(pessimism=th.as_tensor(self.pessimism))
+        self.diagnose(pessimism=self.pessimism, lowered=lowered.mean())
         return target._replace(quantiles=target.quantiles - lowered)
 
 
 class ScaledKappaTDC(TDC):
-    """κ follows the scale of the TD errors, a moving average of mean |mean_j y_j − mean_k z_k| at every 50th update."""
+    """κ follows the size of the errors that it bounds: a moving average of mean |y_j − z_k| at every 50th update."""
 
     def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
         super().diagnose_critics(current, target)
-        errors = target.quantiles.mean(dim=1, keepdim=True) - current.mean(dim=2)
-        scale = float(errors.abs().mean())
+        scale = float((target.quantiles[:, None, None] - current[..., None]).abs().mean())
         if np.isfinite(scale):
             self.kappa = self.kappa + _KAPPA_WEIGHT * (scale - self.kappa)
-        self.diagnose(kappa=th.as_tensor(self.kappa))
+        self.diagnose(kappa=self.kappa)
 
 
 ABLATIONS: dict[str, type[OffPolicyAlgorithm]] = {

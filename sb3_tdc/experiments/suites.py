@@ -78,7 +78,7 @@ LAMBDA: dict[str, list[Cell]] = {
         ("Hopper-v4", "HalfCheetah-v4"),
         *(("tdc", {"lam": lam}) for lam in (0.0, 0.5, 1.0, "auto")),
         ("tdc-shift", {"lam": 1.0}),
-        ("tdc-pessimism", {"lam": "auto_0.0"}),
+        ("tdc-pessimism", {"lam": "auto"}),
         ("tdc-kappa", {"lam": 1.0}),
     )
 }

@@ -265,6 +265,8 @@ def _restart_episodes(model: OffPolicyAlgorithm) -> None:
                     buffer._compute_episode_length(i)
     if model.action_noise is not None:
         model.action_noise.reset()
+    if isinstance(model, CheckedOffPolicyAlgorithm):
+        model.forget_episodes()
     model._last_obs = model.env.reset()  # type: ignore[assignment]
     model._last_episode_starts = np.ones((model.env.num_envs,), dtype=bool)
     if model._vec_normalize_env is not None:

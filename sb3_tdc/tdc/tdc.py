@@ -1,9 +1,7 @@
 """TDC-λ as a Stable-Baselines3 algorithm. ``train()`` follows Algorithm 1 of the paper, phase by phase."""
 
-import copy
 import io
 import pathlib
-import re
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
@@ -26,9 +24,18 @@ from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.common.noise import noise_of_all
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
+from sb3_tdc.common.untrusted import shown
 from sb3_tdc.common.versions import numba_version
+from sb3_tdc.tdc.calibration import (
+    Calibration,
+    PendingEpisode,
+    calibrate,
+    initial_lam,
+    stack_observations,
+    updates_before,
+)
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
-from sb3_tdc.tdc.lam import PendingEpisode, calibrate, describe_selection, initial_lam
+from sb3_tdc.tdc.lam import describe_selection
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
 from sb3_tdc.tdc.quantiles import (
     Target,
@@ -51,8 +58,15 @@ FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
 
 def _lam_field(name: str, value: Any) -> Any:
     """Take a number, a schedule, or how to calibrate λ."""
-    is_text = isinstance(value, str) and re.fullmatch(r"auto(_[0-9.e-]{1,20})?", value)
-    return value if is_text else schedule(name, value)
+    return _lam_text(name, value) if isinstance(value, str) else schedule(name, value)
+
+
+def _lam_text(name: str, value: Any) -> str:
+    """Take how to calibrate λ."""
+    if not isinstance(value, str):
+        raise ValueError(f"{name} must be a text, got {shown(value)}")
+    initial_lam(value)
+    return value
 
 
 class TDC(CheckedOffPolicyAlgorithm):
@@ -118,6 +132,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         "lam": SavedField(_lam_field),
         "_lam_value": SavedField(or_none(number(0.0)), is_required=False),
         "_lam_scale": SavedField(number(0.0), is_required=False),
+        "_lam_start": SavedField(or_none(_lam_text), is_required=False),
         "kappa": SavedField(number(0.0)),
         "qf_learning_rate": SavedField(or_none(schedule)),
         "stochastic_actor": SavedField(boolean),
@@ -137,7 +152,7 @@ class TDC(CheckedOffPolicyAlgorithm):
     changeable: ClassVar[tuple[str, ...]] = (
         *("lam", "kappa", "qf_learning_rate", "policy_delay", "target_policy_noise", "target_noise_clip"),
     )
-    captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics", "_episodes_under_way")
+    captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics", "_calibration")
     color: ClassVar[str | None] = "#0072B2"
     policy: TDCPolicy
     replay_buffer: ReplayBuffer
@@ -220,9 +235,10 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.ent_coef_optimizer: Any = None
         self.ent_coef_tensor: Any = None
         self.fused = fused
-        # Of a calibrated λ: where it is, None where it begins; the moving average of |G − Q₁|
+        # Of a calibrated λ: where it is, the moving average of |G − Q₁|, and the text that both belong to
         self._lam_value: float | None = None
         self._lam_scale = 0.0
+        self._lam_start: str | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -274,7 +290,8 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     @property
     def _calibrated_lam(self) -> float:
-        return initial_lam(self.lam) if self._lam_value is None else self._lam_value  # type: ignore[arg-type]
+        start = initial_lam(self.lam)  # type: ignore[arg-type]
+        return start if self._lam_value is None or self._lam_start != self.lam else self._lam_value
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -289,7 +306,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         self._setup_fused_update()
         self._setup_temperature()
-        self._episodes_under_way: list[PendingEpisode] = []
+        self._calibration = Calibration(self._n_updates)
 
     @property
     def action_noise(self) -> ActionNoise | None:
@@ -608,11 +625,15 @@ class TDC(CheckedOffPolicyAlgorithm):
     # ---------------------------------------------------------------- λ by calibration
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        before = self._last_obs
+        observation, timestep = self._last_obs, self.num_timesteps
         prepared = super()._setup_learn(*args, **kwargs)
-        if self._last_obs is not before:  # the environments were reset
-            self._episodes_under_way = [PendingEpisode() for _ in range(self.n_envs)]
+        # A callback that stops a rollout makes SB3 lose its last step
+        if self._last_obs is not observation or timestep != self._calibration.timestep:
+            self.forget_episodes()
         return prepared
+
+    def forget_episodes(self) -> None:
+        self._calibration.begin_episodes(self.n_envs)
 
     def _store_transition(
         self,
@@ -630,34 +651,49 @@ class TDC(CheckedOffPolicyAlgorithm):
     def _follow_episodes(
         self, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
-        """Add a step of every environment to its episode, and calibrate λ on those that end."""
-        normalization = self._vec_normalize_env
+        """Add a step to the episodes, and change λ if enough of them have ended."""
+        normalization, calibration = self._vec_normalize_env, self._calibration
         rewards = reward if normalization is None else normalization.get_original_reward()
         observations: Any = self._last_obs
-        for i, episode in enumerate(self._episodes_under_way):
+        for i, episode in calibration.episodes.items():
             one = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
-            episode.add(copy.deepcopy(one), action[i].copy(), float(rewards[i]))
+            episode.add(one, action[i], float(rewards[i]))
             if dones[i]:
-                self._calibrate_lam(episode, not infos[i].get("TimeLimit.truncated", False))
-                self._episodes_under_way[i] = PendingEpisode()
+                counts = self._n_updates >= updates_before(self.tau, self.gamma)
+                calibration.end_episode(i, self._prediction_errors(episode, infos[i]) if counts else None)
+        calibration.timestep = self.num_timesteps
+        errors = calibration.take_errors(self._n_updates)
+        if errors is not None:
+            self._calibrate_lam(errors)
 
-    def _calibrate_lam(self, episode: PendingEpisode, terminated: bool) -> None:
-        rewards: Any = episode.rewards
-        if self._vec_normalize_env is not None:  # as the critics learn them
-            rewards = self._vec_normalize_env.normalize_reward(np.asarray(rewards))
-        returns, n_steps = episode.finish(rewards, terminated, self.gamma)
-        if n_steps == 0 or self._n_updates == 0:
-            return
-        some = episode.observations[: len(returns)]
-        stacked = {k: np.stack([o[k] for o in some]) for k in some[0]} if isinstance(some[0], dict) else np.stack(some)
+    def _prediction_errors(self, episode: PendingEpisode, info: dict[str, Any]) -> np.ndarray:
+        """Return G − Q₁ at steps of an ended episode; what comes after a time limit is in G as Q₁ has it."""
         self.policy.set_training_mode(False)
+        rewards = np.asarray(episode.rewards)
+        if self._vec_normalize_env is not None:  # as the critics learn them
+            rewards = self._vec_normalize_env.normalize_reward(rewards)
+        following = 0.0
+        if info.get("TimeLimit.truncated", False) and getattr(self.replay_buffer, "handle_timeout_termination", True):
+            last = stack_observations([info["terminal_observation"]])
+            with th.no_grad():
+                action = self.policy._predict(self.policy.obs_to_tensor(last)[0], deterministic=True)
+            following = float(self._first_values(last, action)[0])
+        returns = episode.returns(rewards, self.gamma, following)
+        actions = th.as_tensor(np.stack(episode.actions), device=self.device)
+        return returns - self._first_values(stack_observations(episode.observations), actions)
+
+    def _first_values(self, observations: Any, actions: th.Tensor) -> np.ndarray:
+        """Q₁ (T,) of a batch of observations as they come, and actions in [-1, 1]."""
         with th.no_grad():
-            actions = th.as_tensor(np.stack(episode.actions[: len(returns)]), device=self.device).float().flatten(1)
-            values = self.critic.q1_forward(self.policy.obs_to_tensor(stacked)[0], actions)  # type: ignore[arg-type]
-        errors = returns - values.squeeze(1).cpu().numpy()
-        known = self._calibrated_lam, self._lam_scale
-        self._lam_value, self._lam_scale = calibrate(*known, errors, n_steps, self.least_lam)
-        self.diagnose(lam_error=th.as_tensor(errors.mean()), lam_scale=th.as_tensor(self._lam_scale))
+            some, flat = self.policy.obs_to_tensor(observations)[0], actions.float().reshape(len(actions), -1)
+            return self.critic.q1_forward(some, flat).squeeze(1).cpu().numpy()  # type: ignore[arg-type]
+
+    def _calibrate_lam(self, errors: np.ndarray) -> None:
+        begun = self._lam_start == self.lam
+        lam, scale = self._calibrated_lam, self._lam_scale if begun else 0.0
+        self._lam_value, self._lam_scale = calibrate(lam, scale, errors, self.least_lam)
+        self._lam_start = str(self.lam)
+        self.diagnose(lam_error=float(errors.mean()), lam_scale=self._lam_scale)
 
     # ---------------------------------------------------------------- saving
 
@@ -703,7 +739,7 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_fused_update", "_built_ent_coef", "_episodes_under_way"]
+        derived = ["_obstacles", "_fused_update", "_built_ent_coef", "_calibration"]
         return [*super()._excluded_save_params(), *networks, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -1,4 +1,6 @@
-"""λ that tunes itself: the direction, the units, and that it survives stopping."""
+"""λ that tunes itself: the direction, the units, what counts, and that it survives stopping."""
+
+import math
 
 import gymnasium as gym
 import numpy as np
@@ -7,66 +9,233 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc import TDC, load_safely
-from sb3_tdc.tdc.lam import MAX_LAM, PendingEpisode, calibrate, initial_lam
+from sb3_tdc.advb import AdvBTDC
+from sb3_tdc.common.returns import discounted_returns, known_steps
+from sb3_tdc.resume.run_state import _restart_episodes as restart_episodes
+from sb3_tdc.tdc import calibration
+from sb3_tdc.tdc.calibration import MAX_LAM, Calibration, PendingEpisode, calibrate, initial_lam, updates_before
 from tests.helpers.tdc import HEADS, TwoActions, make
 
 errors = arrays(np.float64, 5, elements=st.floats(-100, 100, width=32))
 
 
+@pytest.fixture
+def short_period(monkeypatch):
+    monkeypatch.setattr(calibration, "PERIOD", 20)
+
+
+def make_fast(env=None, **kwargs):
+    """Whose calibration begins after two updates."""
+    return make(env or TwoActions(), **{"lam": "auto", "tau": 1.0, "gamma": 0.5, **kwargs})
+
+
+# ---------------------------------------------------------------- the rule
+
+
 def test_one_step_by_hand():
-    # The first episode sets the scale, |4| and |−2| on average: 3; λ moves by 0.1 · 500/1000 · 1/3
-    lam, scale = calibrate(1.0, 0.0, np.array([4.0, -2.0]), 500)
-    assert (lam, scale) == (pytest.approx(1 + 0.05 / 3), 3)
-    # 1,000 steps later the scale has moved by a twentieth of the way from 3 to 1, to 2.9; λ falls by 0.1/2.9
-    lam, scale = calibrate(lam, scale, np.array([-1.0]), 1_000)
+    # The first errors set the scale, |4| and |−2| on average: 3; λ moves by 0.1 · 1/3
+    lam, scale = calibrate(1.0, 0.0, np.array([4.0, -2.0]))
+    assert (lam, scale) == (pytest.approx(1 + 0.1 / 3), 3)
+    # Then the scale moves by a twentieth of the way from 3 to 1, to 2.9; λ falls by 0.1/2.9
+    lam, scale = calibrate(lam, scale, np.array([-1.0]))
     assert scale == pytest.approx(2.9)
-    assert lam == pytest.approx(1 + 0.05 / 3 - 0.1 / 2.9)
+    assert lam == pytest.approx(1 + 0.1 / 3 - 0.1 / 2.9)
+    # An error of many times the scale moves λ no further than by 0.1
+    assert calibrate(1.0, 0.01, np.array([50.0]))[0] == pytest.approx(1.1)
 
 
-@given(errors, st.floats(0, MAX_LAM), st.floats(0, 10), st.integers(1, 5_000))
-def test_underestimation_raises_lam_and_overestimation_lowers_it(errors, lam, scale, n_steps):
-    new, _ = calibrate(lam, scale, errors, n_steps)
+@given(errors, st.floats(0, MAX_LAM), st.floats(0, 10))
+def test_underestimation_raises_lam_and_overestimation_lowers_it(errors, lam, scale):
+    new, _ = calibrate(lam, scale, errors)
     assert 0 <= new <= MAX_LAM
+    assert abs(new - lam) <= 0.1 + 1e-12
     assert (new - lam) * errors.mean() >= 0
 
 
-@given(errors, st.floats(0.1, 10), st.integers(1, 5_000), st.floats(0.01, 1000))
-def test_the_scale_of_rewards_does_not_matter(errors, scale, n_steps, factor):
-    expected, size = calibrate(1.0, scale, errors, n_steps)
-    found, larger = calibrate(1.0, factor * scale, factor * errors, n_steps)
+@given(errors, st.floats(0.1, 10), st.floats(0.01, 1000))
+def test_the_scale_of_rewards_does_not_matter(errors, scale, factor):
+    expected, size = calibrate(1.0, scale, errors)
+    found, larger = calibrate(1.0, factor * scale, factor * errors)
     assert (found, larger) == (pytest.approx(expected), pytest.approx(factor * size))
 
 
 def test_no_error_is_no_division():
-    assert calibrate(1.0, 0.0, np.zeros(3), 10) == (1.0, 0.0)
+    assert calibrate(1.0, 0.0, np.zeros(3)) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize(("text", "expected"), [("auto", 1), ("auto_0.5", 0.5), ("auto_0", 0)])
+@pytest.mark.parametrize(("text", "expected"), [("auto", 1), ("auto_0.5", 0.5), ("auto_0", 0), ("auto_10", 10)])
 def test_where_it_begins(text, expected):
     assert initial_lam(text) == expected
     assert make(lam=text).scheduled("lam") == expected
 
 
-@pytest.mark.parametrize("text", ["automatic", "auto_-1", "auto_nan", "auto_11", "high"])
+@pytest.mark.parametrize(
+    "text",
+    ["automatic", "auto_-1", "auto_nan", "auto_11", "high", "auto0.5", "auto_", "auto_+0.5", "auto_1_0", "auto_5E-1"],
+)
 def test_other_texts_are_refused(text):
     with pytest.raises(ValueError, match="lam must be"):
         make(lam=text)
+
+
+def test_a_board_has_no_calibration():
+    with pytest.raises(ValueError, match="lam must be a number or a schedule with a board, got 'auto'"):
+        AdvBTDC("MlpPolicy", TwoActions(), lam="auto", buffer_size=100)
+
+
+def test_it_waits_until_values_can_have_their_size():
+    assert updates_before(tau=0.005, gamma=0.99) == pytest.approx(20_000)
+    assert updates_before(tau=1.0, gamma=0.0) == 1
+    assert updates_before(tau=0.5, gamma=1.0) == 2_000
+    assert updates_before(tau=0.0, gamma=0.9) == math.inf
+
+
+# ---------------------------------------------------------------- what counts
 
 
 def test_returns_of_an_episode_by_hand():
     episode = PendingEpisode()
     for step in range(25):
         episode.add(np.array([step]), np.array([0.0]), float(step == 24))
-    returns, n_steps = episode.finish(episode.rewards, terminated=True, gamma=0.5)
     assert [int(o[0]) for o in episode.observations] == [0, 10, 20]
-    assert returns.tolist() == [0.5**24, 0.5**14, 0.5**4]
-    assert n_steps == 25
-    returns, n_steps = episode.finish(episode.rewards, terminated=False, gamma=0.5)  # 0.5⁷ < 1 %: 18 steps are known
-    assert (len(returns), n_steps) == (2, 18)
+    assert episode.returns(np.asarray(episode.rewards), 0.5, 0.0).tolist() == [0.5**24, 0.5**14, 0.5**4]
+    assert episode.returns(np.asarray(episode.rewards), 0.5, 6.0).tolist() == [4 * 0.5**24, 4 * 0.5**14, 4 * 0.5**4]
+
+
+def test_it_waits_for_steps_and_for_updates():
+    pending = Calibration(n_updates=100)
+    pending.begin_episodes(2)
+    for _ in range(600):
+        pending.episodes[0].add(np.zeros(1), np.zeros(1), 1.0)
+        pending.episodes[1].add(np.zeros(1), np.zeros(1), 1.0)
+    pending.end_episode(0, np.array([1.0, 2.0]))
+    assert pending.take_errors(5_000) is None  # 600 steps
+    pending.end_episode(1, np.array([3.0]))
+    assert pending.take_errors(1_099) is None
+    assert pending.take_errors(1_100).tolist() == [1, 2, 3]
+    assert pending.take_errors(5_000) is None  # they count once
+    assert pending.episodes[0].rewards == []
+    pending.end_episode(0, None)
+    assert pending.errors == []
+
+
+def test_of_thousands_of_environments_some_are_followed():
+    pending = Calibration()
+    pending.begin_episodes(4096)
+    followed = list(pending.episodes)
+    assert (len(followed), followed[0], followed[-1]) == (16, 0, 4095)
+    assert np.ptp(np.diff(followed)) <= 1
+    pending.begin_episodes(3)
+    assert list(pending.episodes) == [0, 1, 2]
+
+
+GAMMA, HAZARD, LIMIT = 0.95, 0.01, 150
+
+
+def play(rng):
+    """Reward 1 at every step, and an end by itself with the same probability after each: rewards, whether it ended."""
+    length = rng.geometric(HAZARD)
+    return np.ones(min(length, LIMIT)), length <= LIMIT
+
+
+def test_an_exact_critic_is_left_alone_though_time_limits_end_the_good_episodes():
+    rng = np.random.default_rng(0)
+    value = 1 / (1 - GAMMA * (1 - HAZARD))
+    with_values, known = [], []
+    for rewards, terminated in (play(rng) for _ in range(4_000)):
+        episode = PendingEpisode()
+        for reward in rewards:
+            episode.add(np.zeros(1), np.zeros(1), reward)
+        with_values.append(episode.returns(rewards, GAMMA, 0.0 if terminated else value))
+        n_known = known_steps(len(rewards), terminated, GAMMA, LIMIT)
+        known.append(discounted_returns(rewards, GAMMA)[:n_known])
+    assert np.concatenate(with_values).mean() == pytest.approx(value, rel=0.01)
+    assert np.concatenate(known).mean() == pytest.approx(value, rel=0.01)
+
+
+class Recorded(TwoActions):
+    """Writes down what a slow reference needs: observations, actions, rewards, and how each episode ended."""
+
+    def reset(self, **kwargs):
+        observation, info = super().reset(**kwargs)
+        self.trajectory = {"observations": [observation], "actions": [], "rewards": []}
+        return observation, info
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        for name, value in (("observations", observation), ("actions", action), ("rewards", reward)):
+            self.trajectory[name].append(value)
+        if terminated or truncated:
+            self.log.append((self.trajectory, terminated))
+        return observation, reward, terminated, truncated, info
+
+
+def reference_errors(model, normalization, trajectory, terminated):
+    """G − Q₁ in float64, step by step."""
+    observations = [normalization.normalize_obs(o[None]) for o in trajectory["observations"]]
+    scaled = [model.policy.scale_action(action) for action in trajectory["actions"]]
+    scaled.append(model.policy.scale_action(model.predict(observations[-1], deterministic=True)[0][0]))
+
+    def value(step):
+        with th.no_grad():
+            inputs = th.tensor(observations[step]), th.tensor(scaled[step][None], dtype=th.float32)
+            return model.critic(*inputs)[0, 0].double().mean().item()
+
+    following = 0.0 if terminated else value(-1)
+    found = []
+    for step in reversed(range(len(trajectory["rewards"]))):
+        reward = np.clip(trajectory["rewards"][step] / np.sqrt(normalization.ret_rms.var + 1e-8), -10, 10)
+        following = reward + model.gamma * following
+        found.append(following - value(step))
+    return found[::-1][:: calibration.EVERY]
+
+
+@HEADS
+@pytest.mark.parametrize("timeouts_count", [True, False])
+def test_errors_are_those_of_a_slow_reference(monkeypatch, short_period, stochastic_actor, timeouts_count):
+    """Two environments, episodes that end in both ways, normalised observations and rewards; nothing is learned."""
+    monkeypatch.setattr(calibration, "EVERY", 2)
+    logs = [[], []]
+
+    def make_env(i):
+        env = Recorded()
+        env.log = logs[i]
+        env.episode = i - 1  # so that one environment's first episode is cut off and the other's ends by itself
+        return env
+
+    numbers = iter((0, 1))
+    vector = VecNormalize(make_vec_env(lambda: make_env(next(numbers)), 2), training=False)
+    vector.obs_rms.mean, vector.obs_rms.var, vector.ret_rms.var = np.full(3, 0.3), np.full(3, 2.0), np.float64(9.0)
+    model = make_fast(
+        vector, stochastic_actor=stochastic_actor, learning_rate=0.0, qf_learning_rate=0.0, gamma=0.9,
+        replay_buffer_kwargs={"handle_timeout_termination": timeouts_count},
+    )  # fmt: skip
+    ended, end = [], Calibration.end_episode
+
+    def spy(self, env, errors):
+        ended.append((env, len(self.episodes[env].rewards), errors))
+        end(self, env, errors)
+
+    monkeypatch.setattr(Calibration, "end_episode", spy)
+    model.learn(200)
+    assert len(ended) > 20
+    for i, log in enumerate(logs):
+        of_env = [(length, errors) for env, length, errors in ended if env == i]
+        for (trajectory, terminated), (length, errors) in zip(log, of_env, strict=True):
+            assert length == len(trajectory["rewards"])
+            if errors is not None:
+                expected = reference_errors(model, vector, trajectory, terminated or not timeouts_count)
+                np.testing.assert_allclose(errors, expected, rtol=1e-4, atol=1e-5)
+    assert {length for _, length, errors in ended if errors is not None} == {5, 7}
+    assert sum(errors is None for *_, errors in ended) >= 8  # the warm-up, and then ten updates
+
+
+# ---------------------------------------------------------------- in training
 
 
 class Pays(TwoActions):
@@ -80,27 +249,34 @@ class Pays(TwoActions):
 
 
 @pytest.mark.parametrize(("reward", "rises"), [(100.0, True), (-100.0, False)])
-def test_it_follows_the_sign_of_the_error(reward, rises):
+def test_it_follows_the_sign_of_the_error(short_period, reward, rises):
     env = Pays()
     env.reward = reward
-    model = make(env, lam="auto", qf_learning_rate=1e-6, gamma=0.3).learn(400)
+    model = make_fast(env, qf_learning_rate=1e-6, gamma=0.3).learn(400)
     assert (model.scheduled("lam") > 1) is rises
     assert model.logger.name_to_value["train/lam"] == model.scheduled("lam")
+    assert (model.logger.name_to_value["train/lam_error"] > 0) is rises
+
+
+def test_it_works_where_time_limits_are_short(monkeypatch):
+    monkeypatch.setattr(calibration, "PERIOD", 200)
+    model = make(lam="auto", tau=1.0, gamma=0.9, qf_learning_rate=0.0).learn(700)  # Pendulum: 200 steps
+    assert model.scheduled("lam") < 1  # values of 0, and costs
 
 
 @HEADS
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_both_paths_calibrate_alike(stochastic_actor, n_envs):
+def test_both_paths_calibrate_alike(short_period, stochastic_actor, n_envs):
     lams = []
     for fused in (False, True):
         env = make_vec_env(TwoActions, n_envs, seed=1)
-        model = make(env, lam="auto_0.5", fused=fused, stochastic_actor=stochastic_actor, gamma=0.5).learn(300)
+        model = make_fast(env, lam="auto_0.5", fused=fused, stochastic_actor=stochastic_actor).learn(300)
         lams.append(model.scheduled("lam"))
     assert lams[0] != 0.5
     assert lams[0] == pytest.approx(lams[1], abs=1e-3)
 
 
-def test_errors_are_in_the_critics_units():
+def test_errors_are_in_the_critics_units(short_period):
     """With normalised rewards of 1000 times the size, λ is the same."""
     lams = []
     for factor in (1.0, 1000.0):
@@ -108,13 +284,25 @@ def test_errors_are_in_the_critics_units():
             make_vec_env(lambda factor=factor: gym.wrappers.TransformReward(TwoActions(), lambda r: factor * r), 1)
         )
         env.seed(0)
-        lams.append(make(env, lam="auto", gamma=0.5).learn(300).scheduled("lam"))
+        lams.append(make_fast(env).learn(300).scheduled("lam"))
     assert lams[0] != 1
     assert lams[0] == pytest.approx(lams[1], abs=1e-3)
 
 
-def test_it_is_saved_and_continues(tmp_path):
-    model = make(TwoActions(), lam="auto", gamma=0.5).learn(200)
+class Scalar(TwoActions):
+    action_space = gym.spaces.Box(-1.0, 1.0, (), np.float32)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_actions_without_axes(short_period):
+    assert make_fast(Scalar()).learn(200).scheduled("lam") != 1
+
+
+# ---------------------------------------------------------------- stopping and going on
+
+
+def test_it_is_saved_and_continues(tmp_path, short_period):
+    model = make_fast().learn(200)
     value = model.scheduled("lam")
     assert value != 1
     model.save(tmp_path / "model.zip")
@@ -125,19 +313,82 @@ def test_it_is_saved_and_continues(tmp_path):
         assert loaded.scheduled("lam") != value
 
 
-def test_calibrating_changes_nothing_else():
+def test_another_start_begins_anew(tmp_path, short_period):
+    model = make_fast().learn(200)
+    model.save(tmp_path / "model.zip")
+    loaded = TDC.load(tmp_path / "model.zip", env=TwoActions(), lam="auto_0.2")
+    assert loaded.scheduled("lam") == 0.2
+    loaded.learn(100, reset_num_timesteps=False)
+    assert 0 <= loaded.scheduled("lam") < 0.9
+    model.lam = 0.7
+    assert model.scheduled("lam") == 0.7
+    model.lam = "auto_3"
+    assert model.scheduled("lam") == 3
+    model.lam = "nonsense"
+    with pytest.raises(ValueError, match=r"lam must be .*, got 'nonsense'"):
+        model.learn(10, reset_num_timesteps=False)
+
+
+def lengths_of_episodes(monkeypatch):
+    lengths, end = [], Calibration.end_episode
+
+    def spy(self, env, errors):
+        lengths.append(len(self.episodes[env].rewards))
+        end(self, env, errors)
+
+    monkeypatch.setattr(Calibration, "end_episode", spy)
+    return lengths
+
+
+def test_episodes_go_on_from_one_learn_to_the_next(monkeypatch):
+    lengths = lengths_of_episodes(monkeypatch)
+    model = make_fast()
+    for _ in range(20):
+        model.learn(3, reset_num_timesteps=False)
+    assert lengths == [5, 7] * 5
+
+
+def test_a_step_that_a_callback_loses_is_not_joined_with_what_follows(monkeypatch):
+    lengths = lengths_of_episodes(monkeypatch)
+    model = make_fast()
+    model.learn(100, callback=StopTrainingOnMaxEpisodes(3, verbose=0))
+    model.learn(40, reset_num_timesteps=False)
+    assert set(lengths) == {5, 7}
+
+
+def test_episodes_that_start_again_are_new(monkeypatch):
+    lengths = lengths_of_episodes(monkeypatch)
+    model = make_fast().learn(53)  # 4 × (5 + 7) steps, and 5 of the next
+    model.learn(3, reset_num_timesteps=False)
+    restart_episodes(model)
+    assert [episode.rewards for episode in model._calibration.episodes.values()] == [[]]
+    model.learn(30, reset_num_timesteps=False)
+    assert set(lengths) == {5, 7}
+
+
+def test_without_a_reset_the_next_episodes_are_followed_too(tmp_path, short_period):
+    model = make_fast().learn(100)
+    model.save(tmp_path / "model.zip")
+    loaded = TDC.load(tmp_path / "model.zip", env=make_vec_env(TwoActions, 1), force_reset=False)
+    value = loaded.scheduled("lam")
+    loaded.env.reset()
+    loaded.learn(100, reset_num_timesteps=False)
+    assert loaded.scheduled("lam") != value
+
+
+def test_calibrating_changes_nothing_else(short_period):
     """λ is put back after every calibration: the same weights as with this λ."""
 
-    def calibrate_and_put_back(episode, terminated):
-        TDC._calibrate_lam(held, episode, terminated)
+    def calibrate_and_put_back(errors):
+        TDC._calibrate_lam(held, errors)
         calibrated.append(held._lam_value)
         held._lam_value = 0.5
 
     calibrated = []
-    plain = make(TwoActions(), lam=0.5, gamma=0.5, seed=3).learn(150)
-    held = make(TwoActions(), lam="auto_0.5", gamma=0.5, seed=3)
+    plain = make_fast(lam=0.5, seed=3).learn(150)
+    held = make_fast(lam="auto_0.5", seed=3)
     held._calibrate_lam = calibrate_and_put_back
     held.learn(150)
-    assert set(calibrated) - {None, 0.5}
+    assert set(calibrated) - {0.5}
     for one, other in zip(plain.policy.parameters(), held.policy.parameters(), strict=True):
         assert th.equal(one, other)

@@ -104,9 +104,10 @@ def test_both_paths_log_the_same(stochastic_actor, monkeypatch):
     monkeypatch.setattr(tdc, "UNITS_INTERVAL", 5)
     logs = []
     for fused in (False, True):
-        model = make(stochastic_actor=stochastic_actor, fused=fused).learn(120)
+        model = make(stochastic_actor=stochastic_actor, fused=fused, lam=10.0).learn(120)
         logs.append({k: v for k, v in model.logger.name_to_value.items() if "lam" in k or "dormant" in k})
     assert logs[0].keys() == logs[1].keys() > {"train/lam_changes", "train/actor_dormant"}
+    assert logs[0]["train/lam_changes"] > 0.1
     for name, value in logs[0].items():
         assert logs[1][name] == pytest.approx(value, rel=0.05, abs=0.02), name
 
