@@ -251,6 +251,13 @@ def vary(groups: Sequence[Group], key: str) -> list[list[Group]]:
     return [sorted(some, key=lambda g: _sortable(g.setting(key))) for some in found.values() if len(some) > 1]
 
 
+def is_same_but(what: str, one: Group, other: Group) -> bool:
+    """Return whether two groups differ at most in one setting, or, for "algo", in the algorithm alone."""
+    if what == "algo":
+        return _identity(one.runs[0], algo=other.algo) == _identity(other.runs[0])
+    return _identity(one.runs[0], without=what) == _identity(other.runs[0], without=what)
+
+
 def differences(run: Run) -> dict[str, Any]:
     """Return the settings that are not those of this package's ``hyperparams/``, as they are in the run."""
     try:
@@ -296,10 +303,16 @@ def _simulator(versions: Mapping[str, str]) -> dict[str, str]:
     return {"mujoco": "since 3.5" if tuple(map(int, version.groups())) >= (3, 5) else "before 3.5"} if version else {}
 
 
-def _identity(run: Run, without: str | None = None) -> str:
-    """Everything but the seed (and one setting); a default is the same whether it is given or not."""
-    settings = {key: run.setting(key) for key in {**default_settings(run.algo), **run.settings} if key != without}
-    return _canonical([run.algo, run.env_id, settings])
+def _identity(run: Run, without: str | None = None, algo: str | None = None) -> str:
+    """
+    Everything but the seed; a default is the same whether it is given or not.
+
+    :param without: a setting to leave out
+    :param algo: as if it were of this algorithm
+    """
+    algo = algo or run.algo
+    settings = {**default_settings(algo), **run.settings}
+    return _canonical([algo, run.env_id, {key: value for key, value in settings.items() if key != without}])
 
 
 @cache

@@ -118,6 +118,20 @@ def spread_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float
     return float(low), float(high)
 
 
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """
+    Correct p-values for their number, by Holm's method.
+
+    :param p_values: (n,); NaN is left as it is, and not counted
+    :return: (n,), at most 1
+    """
+    known = np.flatnonzero(np.isfinite(p_values))
+    order = known[np.argsort(p_values[known])]
+    corrected = np.full(len(p_values), np.nan)
+    corrected[order] = np.minimum(np.maximum.accumulate(p_values[order] * np.arange(len(order), 0, -1)), 1)
+    return corrected
+
+
 def interquartile_mean(*tasks: np.ndarray, axis: int = -1) -> np.ndarray:
     """
     Mean of the middle half of the scores of all runs on all tasks; of fewer than four scores, that of all.

@@ -14,6 +14,7 @@ from sb3_tdc.experiments.claims import Interval, examine
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
 from sb3_tdc.experiments.published_curves import published_curves
 from sb3_tdc.experiments.results import Group, Run
+from sb3_tdc.experiments.variants import compare_variants
 
 TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
 _PUBLISHED = Path(__file__).with_name("published.yml")
@@ -161,6 +162,8 @@ _LAM_COLUMNS = (
     ("train/lam", "λ", 1),
     ("train/lam_changes", "Choices changed, %", 100),
     ("train/lam_adds_in_std", "Adds to the target, σ", 1),
+    ("train/lowered", "Lowers the target by", 1),
+    ("train/kappa", "κ", 1),
     ("eval/overestimation", "Overestimation", 1),
     ("eval/std_error_correlation", "Correlation of σ and error", 1),
     ("train/actor_dormant", "Dormant units of the actor, %", 100),
@@ -184,7 +187,8 @@ def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
                 **{title: _over_seeds(values) for title, values in logged.items()},
             }
         )
-    return pd.DataFrame(rows)
+    table = pd.DataFrame(rows)
+    return table.loc[:, (table != "–").any()]
 
 
 def _late_means(runs: Sequence[Run], column: str) -> np.ndarray:
@@ -219,6 +223,29 @@ def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
         for claim in examine(groups)
     ]
     return pd.DataFrame(rows)
+
+
+def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
+    """One row for each variant of TDC that is there next to its control."""
+    return pd.DataFrame(
+        [
+            {
+                "Environment": comparison.variant.env_id,
+                "Steps": number(comparison.variant.n_timesteps),
+                "Variant": _of_returns(comparison.variant, comparison.returns[0]),
+                "Control": _of_returns(comparison.control, comparison.returns[1]),
+                "Difference": _with_interval(*comparison.difference),
+                "p": "–" if np.isnan(comparison.p) else f"{comparison.p:.2g}",
+                "Verdict": comparison.verdict,
+            }
+            for comparison in compare_variants(groups)
+        ]
+    )
+
+
+def _of_returns(group: Group, returns: np.ndarray) -> str:
+    mean = plus_minus(returns.mean(), statistics.spread(returns))
+    return f"{group.label}: {mean} ({len(returns)} seed{'s' * (len(returns) != 1)})"
 
 
 def _of_seeds(interval: Interval) -> str:

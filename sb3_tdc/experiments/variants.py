@@ -1,0 +1,86 @@
+"""
+Variants of TDC, each against the control that differs from it in one thing: does it help?
+
+Compared is the mean of a run's evaluations in its last third, fixed before any run was made: less noisy than the last
+evaluation. Differences have Welch's interval over seeds; a verdict needs a p-value below 5 % after Holm's correction
+for the number of variants on that task.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from sb3_tdc.experiments import statistics
+from sb3_tdc.experiments.ablations import ABLATIONS
+from sb3_tdc.experiments.results import Group, is_same_but
+
+_LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    A variant and its control.
+
+    :param difference: of the means, variant − control, with its 95 % interval; NaN where there are too few seeds
+    :param p: corrected for the number of variants; NaN where there are too few seeds
+    """
+
+    variant: Group
+    control: Group
+    returns: tuple[np.ndarray, np.ndarray]
+    difference: tuple[float, float, float]
+    p: float
+
+    @property
+    def verdict(self) -> str:
+        if np.isnan(self.p):
+            return "undecided: too few seeds"
+        if self.p >= _LEVEL:
+            return "undecided"
+        return "better" if self.difference[0] > 0 else "worse"
+
+
+def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
+    """
+    Return the comparisons of every task.
+
+    λ is compared with λ = 0, and an algorithm of the ablations with TDC of the same hyperparameters.
+    """
+    tasks: dict[tuple[str, int], list[Comparison]] = {}
+    for variant, control in _pairs(groups):
+        tasks.setdefault((variant.env_id, variant.n_timesteps), []).append(_compare(variant, control))
+    return [
+        replace(comparison, p=float(p))
+        for of_task in tasks.values()
+        for comparison, p in zip(of_task, statistics.holm(np.array([c.p for c in of_task])), strict=True)
+    ]
+
+
+def _pairs(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
+    finished = [group for group in groups if group.finished]
+    for variant in finished:
+        for control in (group for group in finished if group.algo == "tdc" and group is not variant):
+            of_lam = variant.algo == "tdc" and control.setting("lam") == 0 and is_same_but("lam", variant, control)
+            of_algorithm = variant.algo in ABLATIONS and is_same_but("algo", variant, control)
+            if of_lam or of_algorithm:
+                yield variant, control
+
+
+def _compare(variant: Group, control: Group) -> Comparison:
+    """With the p-value of this comparison alone."""
+    ours, others = (late_returns(group) for group in (variant, control))
+    mean = float(ours.mean() - others.mean())
+    if min(len(ours), len(others)) < 2:
+        return Comparison(variant, control, (ours, others), (mean, np.nan, np.nan), np.nan)
+    test = stats.ttest_ind(ours, others, equal_var=False)
+    interval = test.confidence_interval(1 - _LEVEL)
+    difference = mean, float(interval.low), float(interval.high)
+    return Comparison(variant, control, (ours, others), difference, float(test.pvalue))
+
+
+def late_returns(group: Group) -> np.ndarray:
+    """(runs,), the mean of the evaluations in the last third of every finished run"""
+    return np.array([run.late_evaluations().mean() for run in group.finished])

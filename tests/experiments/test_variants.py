@@ -1,0 +1,99 @@
+"""Variants of TDC against their controls, from folders made by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from sb3_tdc.experiments import sections, statistics, tables
+from sb3_tdc.experiments.results import find_runs, group_runs
+from sb3_tdc.experiments.variants import compare_variants
+from tests.helpers.run_folders import HOPPER, make_run
+
+
+def make_runs(folder, late, algo="tdc", **config):
+    """:param late: of each seed, both evaluations in the last third; the first one does not count"""
+    for seed, (one, other) in enumerate(late, 1):
+        make_run(folder, algo, seed=seed, returns=((-999.0,), (-999.0,), (one,), (other,)), **{**HOPPER, **config})
+
+
+def compare(folder):
+    found = compare_variants(group_runs(find_runs(folder)[0]))
+    return {(c.variant.label, c.control.label): c for c in found}
+
+
+def test_holm_by_hand():
+    # Sorted: 0.01·3, 0.02·2 and 0.04·1, none below the one before it
+    found = statistics.holm(np.array([0.04, 0.01, np.nan, 0.02]))
+    np.testing.assert_allclose(found, [0.04, 0.03, np.nan, 0.04])
+    assert statistics.holm(np.array([0.9, 0.8])).tolist() == [1, 1]
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=10))
+def test_holm_s_rejections_are_those_of_its_definition(p_values):
+    corrected = statistics.holm(np.array(p_values))
+    rejected = 0
+    for k, p in enumerate(sorted(p_values)):
+        if p * (len(p_values) - k) >= 0.05:
+            break
+        rejected += 1
+    assert (corrected < 0.05).sum() == rejected
+
+
+def test_each_variant_has_a_control_that_differs_in_one_thing(tmp_path):
+    for lam in (0.0, 0.5, "auto"):
+        make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], lam=lam)
+    make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo="tdc-shift", lam=0.5)
+    make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo="tdc-kappa", lam=0.5, tau=0.3)  # no control with this τ
+    make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo="td3")
+    found = compare_variants(group_runs(find_runs(tmp_path)[0]))
+    pairs = {tuple((group.algo, group.setting("lam")) for group in (c.variant, c.control)) for c in found}
+    assert pairs == {
+        (("tdc", 0.5), ("tdc", 0.0)),
+        (("tdc", "auto"), ("tdc", 0.0)),
+        (("tdc-shift", 0.5), ("tdc", 0.5)),
+    }
+
+
+def test_the_difference_of_late_evaluations(tmp_path):
+    make_runs(tmp_path, [(99.0, 101.0), (109.0, 111.0), (90.0, 90.0)], lam=0.5)
+    make_runs(tmp_path, [(10.0, 10.0), (20.0, 20.0), (0.0, 0.0)], lam=0.0)
+    (found,) = compare(tmp_path).values()
+    # Welch: s²/n = 100/3 on both sides, ν = 4
+    half = stats.t.ppf(0.975, 4) * np.sqrt(200 / 3)
+    assert found.difference == pytest.approx((90, 90 - half, 90 + half))
+    assert found.p == pytest.approx(2 * stats.t.sf(90 / np.sqrt(200 / 3), 4))
+    assert found.verdict == "better"
+    row = tables.make_variants_table(group_runs(find_runs(tmp_path)[0])).to_dict("records")[0]
+    assert row["Variant"] == "TDC, λ 0.5: 100 ± 10 (3 seeds)"
+    assert row["Difference"] == f"90 [{90 - half:.1f}, {90 + half:.0f}]"
+
+
+def test_many_variants_need_more(tmp_path):
+    make_runs(tmp_path, [(0.0, 0.0), (10.0, 10.0), (20.0, 20.0)], lam=0.0)
+    for lam in (0.25, 0.5, 0.75, 1.0):
+        make_runs(tmp_path, [(25.0, 25.0), (35.0, 35.0), (45.0, 45.0)], lam=lam)
+    found = compare(tmp_path)
+    assert len(found) == 4
+    alone = 2 * stats.t.sf(25 / np.sqrt(200 / 3), 4)
+    assert alone < 0.05
+    assert {c.verdict for c in found.values()} == {"undecided"}
+    assert {round(c.p, 6) for c in found.values()} == {round(4 * alone, 6)}
+
+
+def test_one_seed_decides_nothing(tmp_path):
+    make_runs(tmp_path, [(1.0, 1.0)], lam=0.5)
+    make_runs(tmp_path, [(0.0, 0.0)], lam=0.0)
+    (found,) = compare(tmp_path).values()
+    assert (found.difference[0], found.verdict) == (1, "undecided: too few seeds")
+
+
+def test_a_calibrated_lam_has_its_curve_next_to_the_numbers(tmp_path):
+    pytest.importorskip("matplotlib")
+    for lam in (0.0, 0.5, "auto"):
+        make_runs(tmp_path / "logs", [(1.0, 2.0), (2.0, 3.0)], lam=lam)
+    section = sections.Report(group_runs(find_runs(tmp_path / "logs")[0]), tmp_path / "report").lambda_sweep()
+    assert [picture.name for picture in section.pictures] == ["lambda-curves-1-Hopper-v4", "lambda-sweep-1-Hopper-v4"]
+    assert "λ = auto: 2 (1, 2)" in section.pictures[0].caption
+    assert (tmp_path / "report" / "tables" / "variants.csv").is_file()
