@@ -24,7 +24,8 @@ def numba_version() -> str | None:
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions of everything that computes."""
+    """Return the versions of everything that computes; PyBullet's where it is installed."""
+    pybullet = _installed("pybullet")
     return {
         "python": platform.python_version(),
         "torch": str(th.__version__),  # otherwise a class of PyTorch's
@@ -33,6 +34,7 @@ def library_versions() -> dict[str, str]:
         "gymnasium": gym.__version__,
         "mujoco": _installed("mujoco"),
         "numba": numba_version() or "absent",
+        **({"pybullet": pybullet} if pybullet != "absent" else {}),
     }
 
 
