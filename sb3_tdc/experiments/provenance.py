@@ -70,8 +70,10 @@ def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFr
     """Runs that are not averaged, and why; empty if there are none."""
     rows = []
     for run in runs:
-        if not run.is_finished or run.evaluations is None:
-            if run.is_finished:
+        if not run.is_complete or run.evaluations is None:
+            if run.is_finished and not run.is_complete:
+                why = "a callback ended it early"
+            elif run.is_finished:
                 why = "finished, but was not evaluated"
             elif run.folder.model.is_file():
                 why = "stopped early; the model was saved"

@@ -55,6 +55,7 @@ def published_curves(env_id: str) -> list[PublishedCurve]:
     rows = _read()
     rows = rows[rows["environment"] == env_id]
     curves = []
+    rows = rows[rows["std"].notna()]  # one seed alone has also been evaluated before its training
     for (source, algorithm), some in rows.groupby(["source", "algorithm"], sort=False):
         numbers = [some[name].to_numpy(float) for name in ("step", "mean", "std")]
         curves.append(PublishedCurve(source, algorithm, int(some["seeds"].iloc[0]), *numbers))

@@ -59,6 +59,8 @@ class Run:
         try:
             args, config = folder.args, folder.config
             changed = {key: args[key] for key, default in _SETTINGS.items() if args.get(key, default) != default}
+            if folder.changes:  # half of a run was of other hyperparameters
+                changed["changes"] = folder.changes
             run = cls(
                 folder,
                 args["algo"],
@@ -108,6 +110,11 @@ class Run:
     @cached_property
     def is_finished(self) -> bool:
         return self.folder.is_finished
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether it has also taken all its steps: a callback may have ended it before."""
+        return self.is_finished and self.steps >= self.n_timesteps
 
     @cached_property
     def evaluations(self) -> Evaluations | None:
@@ -191,7 +198,7 @@ class Group:
     @property
     def finished(self) -> tuple[Run, ...]:
         """Those that took all their steps and were evaluated: the only ones that are averaged."""
-        return tuple(run for run in self.runs if run.is_finished and run.evaluations)
+        return tuple(run for run in self.runs if run.is_complete and run.evaluations)
 
     @property
     def seeds(self) -> str:
@@ -211,7 +218,7 @@ def find_runs(folder: Path) -> tuple[list[Run], list[str]]:
     :raises ValueError: if there is none
     """
     runs, unreadable = [], []
-    for path in sorted({config.parent.parent for config in folder.rglob("*/config.yml")}):
+    for path in sorted({config.parent.parent for config in folder.rglob("*/config.yml")}, key=_by_number):
         try:
             runs.append(Run.open(path))
         except ValueError as error:
@@ -220,6 +227,12 @@ def find_runs(folder: Path) -> tuple[list[Run], list[str]]:
         reasons = "; ".join(unreadable) or "no <algorithm>/<environment>_<number>/<environment>/config.yml"
         raise ValueError(f"There are no runs in {folder}: {reasons}")
     return runs, unreadable
+
+
+def _by_number(path: Path) -> tuple[Path, str, int]:
+    """Order folders as they were made: Hopper-v4_10 after Hopper-v4_9."""
+    name, _, number = path.name.rpartition("_")
+    return path.parent, name, int(number) if number.isdigit() else 0
 
 
 def group_runs(runs: Iterable[Run]) -> list[Group]:

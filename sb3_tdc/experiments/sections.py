@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdc.experiments import figures, provenance, statistics, tables
+from sb3_tdc.experiments.claims import MIN_SEEDS_OF_SPREAD
 from sb3_tdc.experiments.curves import bin_width, headline, make_curve, read_evaluations, read_td_errors
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
 from sb3_tdc.experiments.published_curves import published_curves
@@ -331,8 +332,8 @@ class Report:
             "The paper's claims",
             "What the paper says, against the runs that are here, on every task and number of steps. A verdict needs "
             "95 % intervals over seeds that do not overlap (Student's t for means, χ² for standard deviations); heads "
-            "are interchangeable if their intervals lie within a tenth of each other. Everything else is undecided, "
-            "and one seed decides nothing.",
+            "are interchangeable if their intervals lie within a tenth of each other. Everything else is undecided: "
+            f"one seed decides nothing, and fewer than {MIN_SEEDS_OF_SPREAD} decide nothing about a spread.",
         )
         table = tables.make_claims_table(self.groups)
         if len(table):
@@ -354,7 +355,7 @@ class Report:
 
 
 def _steps(groups: Sequence[Group]) -> str:
-    return _and(sorted({f"{group.n_timesteps:,}" for group in groups}, key=len)) + " steps"
+    return _and([f"{steps:,}" for steps in sorted({group.n_timesteps for group in groups})]) + " steps"
 
 
 def _seeds(groups: Sequence[Group], labels: Sequence[str], numbers: Sequence[int] | None = None) -> str:

@@ -71,8 +71,29 @@ def test_final_returns_and_spreads(tmp_path):
     assert found["1", "final", "TDC", "MEOW"].verdict == "undecided: too few seeds"
     assert found["2", "standard", "TDC", "SAC"].verdict != "held"  # the last quantity of that name: late in training
     spreads = [c for c in examine(group_runs(find_runs(tmp_path)[0])) if "over seeds" in c.what]
-    assert [c.verdict for c in spreads if c.sides[1] == "SAC"] == ["held"]  # 1 [0.5, 6.3] and 500 [260, 3142]
-    assert [c.verdict for c in spreads if c.sides[1] == "TD3"] == ["undecided"]
+    assert {c.verdict for c in spreads} == {"undecided: too few seeds"}  # 1 [0.5, 6.3] and 500 [260, 3142], of three
+
+
+def test_ten_seeds_decide_about_a_spread(tmp_path):
+    make_runs(tmp_path, range(100, 110))
+    make_runs(tmp_path, range(0, 1000, 100), algo="sac")
+    make_runs(tmp_path, range(50, 60), algo="td3")
+    spreads = {c.sides[1]: c for c in examine(group_runs(find_runs(tmp_path)[0])) if "over seeds" in c.what}
+    assert spreads["SAC"].verdict == "held"
+    assert spreads["TD3"].verdict == "undecided"
+    assert spreads["SAC"].other.value == pytest.approx(302.77, abs=0.01)
+
+
+def test_other_physics_are_not_compared(tmp_path):
+    make_runs(tmp_path, (100, 101, 102))
+    make_runs(tmp_path, (50, 51, 52), algo="td3")
+    for path in (tmp_path / "td3").glob("*/*"):
+        if path.is_dir():
+            (path / "versions.yml").write_text("mujoco: 4.0.0\n")
+    for path in (tmp_path / "tdc").glob("*/*"):
+        if path.is_dir():
+            (path / "versions.yml").write_text("mujoco: 3.4.0\n")
+    assert compare(tmp_path) == {}
 
 
 def test_what_hyperparams_say_is_what_is_judged(tmp_path):
@@ -95,9 +116,9 @@ def test_runs_of_another_length_are_not_compared(tmp_path):
 
 def test_the_largest_lam_against_the_smallest(tmp_path):
     for lam, spread in ((0.0, 300.0), (0.5, 100.0), (0.9, 1.0)):
-        make_runs(tmp_path, (500 - spread, 500, 500 + spread), lam=lam)
+        make_runs(tmp_path, (*(500 - spread, 500 + spread) * 5, 500), lam=lam)
     (found,) = (c for c in compare(tmp_path).values() if c.says.startswith("3"))
-    assert (found.ours.value, found.other.value, found.verdict) == (1, 300, "held")
+    assert (found.ours.value, found.other.value, found.verdict) == (pytest.approx(1), pytest.approx(300), "held")
 
 
 def test_td_errors_late_in_training(tmp_path):

@@ -19,6 +19,14 @@ def test_known_numbers():
     assert published_curves("Pendulum-v1") == []
 
 
+def test_the_seeds_of_a_curve_are_those_of_its_training():
+    """CrossQ on Humanoid has one seed at step 0, and ten from then on."""
+    (crossq,) = (curve for curve in published_curves("Humanoid-v4") if curve.algorithm == "CrossQ")
+    assert (crossq.seeds, int(crossq.steps[0])) == (10, 18_000)
+    _, low, high = crossq.at(18_000)
+    assert (high - low) / 2 == pytest.approx(2.262 * 121.9 / 10**0.5, rel=1e-3)
+
+
 def test_between_points_and_beyond_the_last():
     steps = np.array([100.0, 300.0])
     curve = PublishedCurve("somewhere", "SAC", 4, steps, np.array([10.0, 20.0]), np.array([2.0, 4.0]))

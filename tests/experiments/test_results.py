@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sb3_tdc.experiments.provenance import list_unfinished
 from sb3_tdc.experiments.results import describe, differences, find_runs, group_runs, vary
 from sb3_tdc.experiments.suites import SUITES, Cell
 from tests.helpers.run_folders import NETWORKS, make_run
@@ -119,15 +120,17 @@ def test_a_damaged_file_is_listed_and_the_others_are_read(tmp_path, name, damage
     assert str(broken.path) in unreadable[0]
 
 
-def test_a_run_that_a_callback_ended_is_finished_for_all(tmp_path):
-    """``train.py`` marks its runs; how many steps they have does not matter then."""
+def test_a_run_that_a_callback_ended_is_finished_for_all_but_not_averaged(tmp_path):
+    """``train.py`` marks its runs; how many steps they have matters to averages alone."""
     folder = make_run(tmp_path, steps=400, args={"resume_freq": 100})
     assert not find_runs(tmp_path)[0][0].is_finished
     folder.mark_finished(400)
     (run,), _ = find_runs(tmp_path)
     assert (run.is_finished, run.folder.is_finished, run.steps, run.n_timesteps) == (True, True, 400, 1000)
     (group,) = group_runs([run])
-    assert group.finished == (run,)
+    assert group.finished == ()
+    (row,) = list_unfinished([run], []).to_dict("records")
+    assert (row["Steps"], row["Why"]) == ("400 of 1,000", "a callback ended it early")
 
 
 def test_a_run_of_rl_zoo_with_other_steps_on_its_command_line(tmp_path):
@@ -144,3 +147,17 @@ def test_runs_with_other_contacts_are_not_averaged(tmp_path):
         (run.path / run.env_name / "versions.yml").write_text(f"mujoco: {mujoco}\n")
     groups = {group.label: group.seeds for group in group_runs(find_runs(tmp_path)[0])}
     assert groups == {"TDC, MuJoCo before 3.5": "2 (1, 4)", "TDC, MuJoCo since 3.5": "2 (2, 3)"}
+
+
+def test_a_run_whose_hyperparameters_were_changed_is_another_experiment(tmp_path):
+    make_run(tmp_path, seed=1, lam=0.5)
+    changed = make_run(tmp_path, seed=2, lam=0.5)
+    (changed.path / changed.env_name / "changes.yml").write_text("changes:\n- {step: 100, lam: 0.5}\n")
+    assert sorted(group.seeds for group in group_runs(find_runs(tmp_path)[0])) == ["1 (1)", "1 (2)"]
+
+
+def test_of_two_runs_of_one_seed_the_later_one_counts_after_nine_too(tmp_path):
+    for i in range(1, 12):
+        make_run(tmp_path, seed=1, returns=((float(i),),))
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert group.runs[0].folder.path.name == "Hopper-v4_11"
