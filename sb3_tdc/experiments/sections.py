@@ -76,6 +76,12 @@ class Report:
         path.parent.mkdir(parents=True, exist_ok=True)
         table.to_csv(path, index=False)
 
+    def add_table(self, section: Section, name: str, table: pd.DataFrame, caption: str = "") -> None:
+        """Write a table of cells to read, and show it; an empty one is left out."""
+        if len(table):
+            self.write_table(name, table)
+            section.tables.append((caption, table))
+
     def by_env(self, groups: Iterable[Group]) -> dict[str, list[Group]]:
         """The paper's order of tasks, then the alphabet's."""
         found: dict[str, list[Group]] = {}
@@ -214,23 +220,21 @@ class Report:
                         self.colors["TDC"],
                     )
                 )
-        table = tables.make_lam_table(self.groups)
-        if len(table):
-            self.write_table("lambda", table)
-            caption = (
-                "What λ does, in the last third of the runs: means over seeds ± standard deviation. With λ = 0 nothing "
-                "is changed, by definition. Overestimation is what the critics predict minus the return that follows."
-            )
-            section.tables.append((caption, table))
-        variants = tables.make_variants_table(self.groups)
-        if len(variants):
-            self.write_table("variants", variants)
-            caption = (
-                "Variants of TDC, each against the control that differs in one thing: mean ± standard deviation over "
-                "seeds of the evaluations in the last third of a run; the difference with Welch's 95 % interval; its "
-                "p-value, corrected for the number of variants on the task by Holm's method."
-            )
-            section.tables.append((caption, variants))
+        self.add_table(
+            section,
+            "lambda",
+            tables.make_lam_table(self.groups),
+            "What λ does, in the last third of the runs: means over seeds ± standard deviation. With λ = 0 nothing "
+            "is changed, by definition. Overestimation is what the critics predict minus the return that follows.",
+        )
+        self.add_table(
+            section,
+            "variants",
+            tables.make_variants_table(self.groups),
+            "Variants of TDC, each against the control that differs in one thing: mean ± standard deviation over "
+            "seeds of the evaluations in the last third of a run; the difference with Welch's 95 % interval; its "
+            "p-value, corrected for the number of variants on the task by Holm's method.",
+        )
         return section
 
     def heads(self) -> Section:
@@ -314,17 +318,14 @@ class Report:
             "last one). They say whether ours are of the right size, and no more. Steps and seeds that differ by task "
             "are in the order of the columns. The TDC-λ paper itself prints no returns, only curves.",
         )
-        table = tables.make_published_table(self.returns)
-        self.write_table("published", table)
-        section.tables.append(("", table))
-        at_our_steps = tables.make_published_curves_table(self.groups)
-        if len(at_our_steps):
-            self.write_table("published_curves", at_our_steps)
-            caption = (
-                "Published learning curves at the number of steps of ours, as mean [95 % interval of the mean over "
-                "seeds]. Theirs are from the repository of SimbaV2, of evaluations with MuJoCo before 3.5."
-            )
-            section.tables.append((caption, at_our_steps))
+        self.add_table(section, "published", tables.make_published_table(self.returns))
+        self.add_table(
+            section,
+            "published_curves",
+            tables.make_published_curves_table(self.groups),
+            "Published learning curves at the number of steps of ours, as mean [95 % interval of the mean over "
+            "seeds]. Theirs are from the repository of SimbaV2, of evaluations with MuJoCo before 3.5.",
+        )
         return section
 
     def claims(self) -> Section:
@@ -335,10 +336,7 @@ class Report:
             "are interchangeable if their intervals lie within a tenth of each other. Everything else is undecided: "
             f"one seed decides nothing, and fewer than {MIN_SEEDS_OF_SPREAD} decide nothing about a spread.",
         )
-        table = tables.make_claims_table(self.groups)
-        if len(table):
-            self.write_table("claims", table)
-            section.tables.append(("", table))
+        self.add_table(section, "claims", tables.make_claims_table(self.groups))
         return section
 
     def missing(self, runs: Sequence[Run], unreadable: Sequence[str]) -> Section:
