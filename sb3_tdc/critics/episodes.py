@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_tdc.common.returns import discounted_returns, known_steps
 from sb3_tdc.tdc import TDC
+from sb3_tdc.tdc.calibration import stack_observations
 from sb3_tdc.tdc.quantiles import mean_and_std, quantile_midpoints, select_critic
 
 
@@ -208,8 +209,7 @@ def predict_quantiles(
     policy.set_training_mode(False)
     predicted = []
     for begin in range(0, len(observations), batch_size):
-        some = observations[begin : begin + batch_size]
-        stacked = {k: np.stack([o[k] for o in some]) for k in some[0]} if isinstance(some[0], dict) else np.stack(some)
+        stacked = stack_observations(observations[begin : begin + batch_size])
         with th.no_grad():
             scaled = th.as_tensor(policy.scale_action(actions[begin : begin + batch_size]), device=model.device)
             predicted.append(policy.critic(policy.obs_to_tensor(stacked)[0], scaled.float().flatten(1)).cpu())
