@@ -1,6 +1,6 @@
 import sys
 
-from sb3_tdc.cli.enjoy import main
+from sb3_tdc.__main__ import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["enjoy", *sys.argv[1:]]))

@@ -1,6 +1,6 @@
 import sys
 
-from sb3_tdc.cli.train import main
+from sb3_tdc.__main__ import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["train", *sys.argv[1:]]))

@@ -1,9 +1,6 @@
 import sys
 
-try:
-    from sb3_tdc.cli.tune import main
-except ImportError as error:
-    sys.exit(str(error))
+from sb3_tdc.__main__ import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(["tune", *sys.argv[1:]]))

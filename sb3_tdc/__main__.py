@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from sb3_tdc.common.checks import suggest
+from sb3_tdc.common.commands import command
+from sb3_tdc.common.output import harmless_output
 
 COMMANDS = {
     "train": "train an agent, or resume a run",
@@ -26,13 +28,33 @@ _STARTED_BY_OTHERS = ("job",)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Run a command.
+    Run a command; Ctrl-C, a closed pipe and a file that cannot be read or written end it without a traceback.
 
     :param argv: its name and its arguments, those of the process by default
     :return: its exit status
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    name = arguments.pop(0) if arguments else "--help"
+    name, *arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    try:
+        try:
+            return _run(name, arguments)
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # here a closed pipe can still be answered
+    except KeyboardInterrupt:
+        status, sentence = 130, "Stopped."
+    except BrokenPipeError:  # whoever reads has seen enough: sb3-tdc enjoy ... | head -1
+        status, sentence = 128 + 13, ""  # as if SIGPIPE had ended it
+    except OSError as error:
+        reason = error.strerror or " ".join(str(error).split())
+        place = f"{error.filename}: " if error.filename is not None else ""
+        status, sentence = 1, f"{command(name)}: error: {place}{reason}"
+    with harmless_output():
+        if sentence:
+            print(sentence, file=sys.stderr)
+    return status
+
+
+def _run(name: str, arguments: Sequence[str]) -> int:
     if name in ("-h", "--help"):
         print(_USAGE)
         return 0
@@ -45,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         module = importlib.import_module(f"sb3_tdc.cli.{name}")
     except ImportError as error:  # with the command that installs what is missing
-        print(f"sb3-tdc {name}: error: {error}", file=sys.stderr)
+        print(f"{command(name)}: error: {error}", file=sys.stderr)
         return 2
     return module.main(arguments)
 
