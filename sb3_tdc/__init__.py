@@ -1,13 +1,29 @@
 """TDC-λ and the paper's rivals for Stable-Baselines3: ``from sb3_tdc import TDC``."""
 
+import importlib
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
 
-from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
-from sb3_tdc.common.diagnostics import NonFiniteError
-from sb3_tdc.meow import MEOW
-from sb3_tdc.resume import ResumeStates
-from sb3_tdc.safe_load import UnsafeFileError, load_safely
-from sb3_tdc.tdc import TDC
+if TYPE_CHECKING:
+    from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
+    from sb3_tdc.common.diagnostics import NonFiniteError
+    from sb3_tdc.meow import MEOW
+    from sb3_tdc.resume import ResumeStates
+    from sb3_tdc.safe_load import UnsafeFileError, load_safely
+    from sb3_tdc.tdc import TDC
+
+# Imported when they are asked for: PyTorch takes seconds, in which `sb3-tdc` could answer neither --help nor Ctrl-C
+_MODULES = {
+    "MEOW": "meow",
+    "TDC": "tdc",
+    "AdvBSAC": "advb",
+    "AdvBTD3": "advb",
+    "AdvBTDC": "advb",
+    "NonFiniteError": "common.diagnostics",
+    "ResumeStates": "resume",
+    "UnsafeFileError": "safe_load",
+    "load_safely": "safe_load",
+}
 
 __version__ = version("sb3-tdc")
 __all__ = [
@@ -22,3 +38,9 @@ __all__ = [
     "__version__",
     "load_safely",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from sb3_tdc.common.checks import suggest
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.output import harmless_output
 
@@ -62,6 +61,8 @@ def _run(name: str, arguments: Sequence[str]) -> int:
         print(f"sb3-tdc {version('sb3-tdc')}")
         return 0
     if name not in (*COMMANDS, *_STARTED_BY_OTHERS):
+        from sb3_tdc.common.checks import suggest  # imports PyTorch
+
         print(f"sb3-tdc: error: unknown command {name!r}{suggest(name, COMMANDS)}\n{_USAGE}", file=sys.stderr)
         return 2
     try:

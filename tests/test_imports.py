@@ -4,6 +4,9 @@ import subprocess
 import sys
 
 import grimp
+import pytest
+
+import sb3_tdc
 
 
 def test_no_modules_import_each_other_in_a_circle():
@@ -21,6 +24,20 @@ def test_the_package_is_imported_without_simulators_plots_and_searches():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_what_the_package_offers_is_there():
+    for name in sb3_tdc.__all__:
+        assert name == "__version__" or getattr(sb3_tdc, name).__module__.startswith("sb3_tdc.")
+    with pytest.raises(AttributeError, match="no attribute 'TCD'"):
+        _ = sb3_tdc.TCD
+
+
+def test_the_command_answers_before_pytorch_is_imported():
+    """Importing it takes seconds, in which a Ctrl-C would end in a traceback."""
+    code = "import sys, sb3_tdc.__main__; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]
 
 
 def test_the_commands_that_draw_nothing_choose_mujocos_backend_themselves():
