@@ -109,7 +109,9 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
     )
     results = tuner.fit()
     failed = [str(error).strip().splitlines()[-1] for error in results.errors]
-    return results.num_terminated + results.num_errors == len(trials), failed
+    # Not Ray's states: after a Ctrl-C it calls all trials terminated, also those that it never began
+    ended = [result for result in results if result.error is not None or (result.metrics or {}).get("done")]
+    return len(ended) == len(trials), failed
 
 
 def make_trials(

@@ -122,7 +122,8 @@ def finish(process):
 
 
 @pytest.mark.slow
-def test_a_search_that_is_killed_goes_on_to_the_same_end(tmp_path):
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_search_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
     options = ["--search", "lam:[0.0, 1.0]"]
     out, status = finish(start(*arguments(tmp_path / "alone", 2000), *options))
     assert status == 0, out
@@ -137,8 +138,11 @@ def test_a_search_that_is_killed_goes_on_to_the_same_end(tmp_path):
         time.sleep(0.05)
     family = runs_of(process.pid)
     assert family
-    os.kill(process.pid, signal.SIGKILL)
-    finish(process)
+    os.kill(process.pid, how)
+    out, status = finish(process)
+    assert status == {signal.SIGKILL: -9, signal.SIGINT: 130}[how], out
+    assert not (killed / "best.yml").exists()
+    assert how == signal.SIGKILL or f"tune.py --resume {killed}" in out
     deadline = time.monotonic() + 30
     while any(is_running(pid) for pid in family):
         assert time.monotonic() < deadline
