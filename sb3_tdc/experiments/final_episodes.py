@@ -85,7 +85,7 @@ def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()
     trained = open_run(run.folder, run.folder.model, packages)
     env = trained.make_env(FIRST_SEED, **(trained.eval_env_kwargs or trained.env_kwargs))
     with closing(env):
-        returns = play_final_episodes(trained.load(None, "cpu"), env, episodes)
+        returns = play_final_episodes(trained.load(env, "cpu"), env, episodes)
     contents: dict[str, Any] = {"returns": returns, "checksum": before, "first_seed": FIRST_SEED}
     write_atomically(lambda part: np.savez(part, **contents), run.folder.path / FILE)
     return returns

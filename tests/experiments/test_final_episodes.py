@@ -1,0 +1,36 @@
+"""Test episodes, held against the same ones played by hand."""
+
+import gymnasium as gym
+from stable_baselines3.common.envs import BitFlippingEnv
+
+from sb3_tdc import TDC
+from sb3_tdc.cli import evaluate, train
+from sb3_tdc.experiments.final_episodes import read_test_returns
+from sb3_tdc.experiments.results import Run
+
+SMALL = ["policy_kwargs:{net_arch: [8], n_quantiles: 4}", "learning_starts:20", "batch_size:8", "buffer_size:500"]
+HER = ["replay_buffer_class:HerReplayBuffer", "policy:MultiInputPolicy"]
+
+
+gym.register("HindsightBits-v0", lambda **kwargs: BitFlippingEnv(n_bits=3, continuous=True), max_episode_steps=5)
+
+
+def test_a_model_that_needs_its_environment_to_be_loaded(tmp_path):
+    """With hindsight, the replay buffer asks the environment for rewards."""
+    arguments = ["--env", "HindsightBits-v0", "-n", "60", "--seed", "1", "-f", str(tmp_path), "--verbose", "0"]
+    assert train.main([*arguments, "--eval-freq", "30", "--eval-episodes", "1", "-params", *SMALL, *HER]) == 0
+    assert evaluate.main([str(tmp_path), "--episodes", "3"]) == 0
+    run = Run.open(tmp_path / "tdc" / "HindsightBits-v0_1")
+
+    env = gym.make("HindsightBits-v0")
+    model = TDC.load(run.folder.model, env, device="cpu")
+    expected = []
+    for seed in (10_000, 10_001, 10_002):
+        observation, _ = env.reset(seed=seed)
+        total, done = 0.0, False
+        while not done:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            total, done = total + reward, terminated or truncated
+        expected.append(total)
+    assert read_test_returns(run).tolist() == expected
