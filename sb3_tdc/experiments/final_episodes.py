@@ -14,7 +14,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tdc.common.files import write_atomically
+from sb3_tdc.common.files import check_writable, write_atomically
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.runs.trained import open_run
 
@@ -76,16 +76,18 @@ def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()
 
     :param packages: those that a run may import, to register its environment
     :return: (episodes,)
-    :raises ValueError: if the run cannot be loaded
+    :raises ValueError: if the run cannot be loaded, or its returns cannot be written
     """
     kept = read_test_returns(run)
     if kept is not None and len(kept) >= episodes:
         return kept[:episodes]
+    path = run.folder.path / FILE
+    check_writable("Test returns:", path)
     before = checksum(run)
     trained = open_run(run.folder, run.folder.model, packages)
     env = trained.make_env(FIRST_SEED, **(trained.eval_env_kwargs or trained.env_kwargs))
     with closing(env):
         returns = play_final_episodes(trained.load(env, "cpu"), env, episodes)
     contents: dict[str, Any] = {"returns": returns, "checksum": before, "first_seed": FIRST_SEED}
-    write_atomically(lambda part: np.savez(part, **contents), run.folder.path / FILE)
+    write_atomically(lambda part: np.savez(part, **contents), path)
     return returns

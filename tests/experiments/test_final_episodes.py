@@ -1,12 +1,15 @@
 """Test episodes, held against the same ones played by hand."""
 
 import gymnasium as gym
+import pytest
 from stable_baselines3.common.envs import BitFlippingEnv
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import evaluate, train
+from sb3_tdc.experiments import final_episodes
 from sb3_tdc.experiments.final_episodes import read_test_returns
 from sb3_tdc.experiments.results import Run
+from tests.helpers.run_folders import make_run
 
 SMALL = ["policy_kwargs:{net_arch: [8], n_quantiles: 4}", "learning_starts:20", "batch_size:8", "buffer_size:500"]
 HER = ["replay_buffer_class:HerReplayBuffer", "policy:MultiInputPolicy"]
@@ -34,3 +37,11 @@ def test_a_model_that_needs_its_environment_to_be_loaded(tmp_path):
             total, done = total + reward, terminated or truncated
         expected.append(total)
     assert read_test_returns(run).tolist() == expected
+
+
+def test_nothing_is_played_whose_returns_cannot_be_written(tmp_path, monkeypatch):
+    run = make_run(tmp_path)
+    (run.path / final_episodes.FILE).mkdir()
+    monkeypatch.setattr(final_episodes, "open_run", lambda *args: pytest.fail("it was opened to be played"))
+    with pytest.raises(ValueError, match=r"^Test returns: \S+ cannot be written: Is a directory$"):
+        final_episodes.measure_run(Run.open(run.path))
