@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.commands import command
+from sb3_tdc.common.files import check_can_be_made
 from sb3_tdc.experiments import final_episodes as test_returns
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.publish import RESULTS, publish
@@ -17,7 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Copy the small files of finished runs.
 
     :param argv: arguments, those of the process by default
-    :return: 0, or 1 if a finished run has not played its test episodes
+    :return: 0, or 1 if there is nothing to publish, or a finished run has not played its test episodes
     """
     know_ablations()
     parser = Parser(
@@ -28,10 +29,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         runs, unreadable = find_runs(args.logs)
+        check_can_be_made("-o", args.output)
     except ValueError as error:
         parser.fail(error)
+    to_publish = [run for run in runs if run.is_finished and run.evaluations is not None]
+    if not to_publish:
+        print(f"Nothing to publish: {args.logs} has no run that is finished and evaluated", file=sys.stderr)
     untested = []
-    for run in (run for run in runs if run.is_finished and run.evaluations is not None):
+    for run in to_publish:
         place = publish(run, args.logs, args.output)
         size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
         print(f"{place}: {size / 1000:.0f} kB")
@@ -41,4 +46,4 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(text, file=sys.stderr)
     if untested:
         print(f"Without test episodes: {', '.join(map(str, untested))} ({command('evaluate', args.logs)})")
-    return int(bool(untested))
+    return int(bool(untested) or not to_publish)

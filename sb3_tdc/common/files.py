@@ -39,6 +39,20 @@ def check_writable(flag: str, path: Path) -> None:
         raise ValueError(f"{flag} {path} cannot be written: {error.strerror}") from error
 
 
+def check_can_be_made(flag: str, folder: Path) -> None:
+    """
+    Check that files can be made in a folder, or the folder in the nearest one that exists; nothing is made.
+
+    :param flag: that named the folder, for the error
+    :raises ValueError: if they cannot
+    """
+    nearest = next(path for path in (folder, *folder.parents) if path.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"{flag} {folder} cannot be written: {nearest} is not a folder")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ValueError(f"{flag} {folder} cannot be written: {nearest} is read-only")
+
+
 def make_numbered(parent: Path, name: str, suffix: str = "") -> Path:
     """Make the folder ``<name>_<next number>``; two processes that start at once get one each."""
     parent.mkdir(parents=True, exist_ok=True)

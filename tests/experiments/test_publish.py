@@ -73,12 +73,23 @@ def test_the_matrix_skips_what_is_published(logs, tmp_path, monkeypatch, capsys)
     assert "seed 4" in out
 
 
-def test_unfinished_runs_are_not_published(logs, tmp_path):
+def test_unfinished_runs_are_not_published(logs, tmp_path, capsys):
     copy = tmp_path / "logs"
     shutil.copytree(logs, copy)
     next(copy.rglob("finished.yml")).unlink()
-    assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 0
+    assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 1
+    assert f"Nothing to publish: {copy} has no run that is finished" in capsys.readouterr().err
     assert not (tmp_path / "results").exists()
+
+
+def test_a_place_that_cannot_be_written_is_said_at_once(logs, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit) as stopped:
+        publish.main([str(logs), "-o", str(tmp_path / "file" / "results")])
+    assert stopped.value.code == 2
+    captured = capsys.readouterr()
+    assert f"-o {tmp_path}/file/results cannot be written: {tmp_path}/file is not a folder" in captured.err
+    assert captured.out == ""
 
 
 def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
