@@ -3,22 +3,29 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.cli.arguments import Parser, add_settings, one_of
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.commands import command
-from sb3_tdc.common.files import numbered
+from sb3_tdc.common.files import check_can_be_made, lock, numbered, write_atomically
+from sb3_tdc.common.output import harmless_output
+from sb3_tdc.common.words import count
 from sb3_tdc.envs.registry import import_packages, split_env_id
-from sb3_tdc.experiments.jobs import cluster, eval_freq
+from sb3_tdc.experiments.jobs import Job, cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs
 from sb3_tdc.experiments.trials import make_trials, read_returns, run_trials
 from sb3_tdc.runs.folder import folder_name
 from sb3_tdc.runs.settings import plain_arguments
+from sb3_tdc.safe_load.regular_files import read_text
 
 _ARGUMENTS = "search.yml"
+_MAX_BYTES = 2**20
+_OF_THE_PROCESS = ("resume", "jobs", "address")
 
 
 def make_parser() -> Parser:
@@ -47,29 +54,69 @@ def make_parser() -> Parser:
 
 def _read_arguments(args: argparse.Namespace, given: dict[str, Any]) -> None:
     """
-    Those of a search that is resumed.
+    Take the arguments of the search that is resumed.
 
-    :raises ValueError: if there is none, or the command line contradicts it
+    :raises ValueError: if there is none, its file is damaged, or the command line contradicts it
     """
-    try:
-        stored = plain_yaml.load((args.resume / _ARGUMENTS).read_text(), str(args.resume / _ARGUMENTS))
-    except OSError as error:
-        raise ValueError(f"{args.resume} is not the folder of a search: it has no readable {_ARGUMENTS}") from error
-    of_the_process = ("resume", "jobs", "address")
+    stored = _read_stored(args.resume / _ARGUMENTS)
     for name, value in given.items():
-        if name not in of_the_process and str(value) != str(stored.get(name)):
-            raise ValueError(f"--{name} {value} contradicts the search in {args.resume}: {stored.get(name)}")
-    vars(args).update({name: value for name, value in stored.items() if name not in of_the_process})
+        if name in stored and str(value) != str(stored[name]):
+            raise ValueError(
+                f"--{name.replace('_', '-')} {value} contradicts the search in {args.resume}: {stored[name]}"
+            )
+    vars(args).update(stored)
     args.folder = args.resume.resolve()
+
+
+def _read_stored(path: Path) -> dict[str, Any]:
+    """
+    Read the arguments of a search, without those that belong to a process.
+
+    :raises ValueError: if one is missing, or is none that the command line would have given
+    """
+    if not path.is_file():
+        raise ValueError(f"{path.parent} is not the folder of a search: it has no {path.name}")
+    stored = plain_yaml.load(read_text(path, _MAX_BYTES), str(path))
+    if not isinstance(stored, dict):
+        raise ValueError(f"{path} must be a mapping of arguments to values")
+    defaults = plain_arguments(vars(make_parser().parse_args([])))
+    arguments = {name: stored.get(name) for name in defaults if name not in _OF_THE_PROCESS}
+    for name, value in arguments.items():
+        kind = type(defaults[name])
+        if type(value) is not kind:
+            raise ValueError(f"{path}: {name} must be of type {kind.__name__}, got {value!r}")
+        if isinstance(value, (list, dict)) and not all(isinstance(each, str) for each in value):
+            raise ValueError(f"{path}: {name} must hold texts, got {value!r}")
+    try:
+        one_of("algorithm", ALGORITHMS)(str(arguments["algo"]))
+    except argparse.ArgumentTypeError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return arguments
 
 
 def _make_folder(args: argparse.Namespace) -> Path:
     """Return the next free folder of a search; it does not exist yet."""
     parent = args.logs.resolve() / "search" / args.algo
     name = folder_name(args.env)
-    return parent / f"{name}_{max(numbered(parent, name), default=0) + 1}"
+    folder = parent / f"{name}_{max(numbered(parent, name), default=0) + 1}"
+    check_can_be_made("--logs", folder)
+    return folder
 
 
+def _lock(folder: Path) -> Any:
+    """
+    Keep other processes out of a search.
+
+    :return: to be held as long as the search lasts
+    :raises ValueError: if another process runs the search
+    """
+    locked = lock(folder / _ARGUMENTS)
+    if locked is None:
+        raise ValueError(f"Another process runs the search in {folder}")
+    return locked
+
+
+@harmless_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Search hyperparameters.
@@ -80,27 +127,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = make_parser()
     args, given = parser.parse_args(argv), parser.parse_given(argv)
     try:
-        if args.resume is not None:
-            _read_arguments(args, given)
-        typed = plain_arguments(vars(args))
-        args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
-        import_packages(args.gym_packages)
-        if args.resume is None:
-            args.folder = _make_folder(args)
-        candidates = make_candidate_jobs(args)
-        trials = make_trials(candidates, args.searched, args.asha)
-        with cluster(args.address, args.jobs):
-            if args.resume is None:
-                args.folder.mkdir(parents=True)
-                (args.folder / _ARGUMENTS).write_text(plain_yaml.dump(typed))
-            print(
-                f"{len(candidates)} candidates × {args.seeds} seeds, {args.n_timesteps:,} steps each, evaluated every "
-                f"{eval_freq(args.n_timesteps):,} (5 episodes); one CPU and one thread a seed; in {args.folder}",
-                flush=True,
-            )
-            is_complete, failed = run_trials(args, trials)
+        return _search(args, given)
     except ValueError as error:
         parser.fail(error)
+
+
+def _search(args: argparse.Namespace, given: dict[str, Any]) -> int:
+    """
+    Check the arguments, take the folder of the search, and run it.
+
+    :return: the exit status
+    :raises ValueError: for anything that is not allowed, before anything is made
+    """
+    if args.resume is not None:
+        _read_arguments(args, given)
+    typed = plain_arguments(vars(args))
+    args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
+    import_packages(args.gym_packages)
+    if args.resume is None:
+        args.folder = _make_folder(args)
+    candidates = make_candidate_jobs(args)
+    with ExitStack() as stack:
+        if args.resume is not None:
+            stack.enter_context(_lock(args.folder))
+        stack.enter_context(cluster(args.address, args.jobs))
+        if args.resume is None:
+            args.folder.mkdir(parents=True)
+            write_atomically(lambda part: part.write_text(plain_yaml.dump(typed)), args.folder / _ARGUMENTS)
+            stack.enter_context(_lock(args.folder))
+        return _run(args, candidates)
+
+
+def _run(args: argparse.Namespace, candidates: Sequence[Sequence[Job]]) -> int:
+    """Train the candidates, and rank them if all have come to their end. :return: the exit status"""
+    print(
+        f"{count(len(candidates), 'candidate')} × {count(args.seeds, 'seed')}, {count(args.n_timesteps, 'step')} each, "
+        f"evaluated every {eval_freq(args.n_timesteps):,} (5 episodes); one CPU and one thread a seed; "
+        f"in {args.folder}",
+        flush=True,
+    )
+    try:
+        is_complete, failed = run_trials(args, make_trials(candidates, args.searched, args.asha))
     except KeyboardInterrupt:
         is_complete, failed = False, []
     for sentence in failed:

@@ -74,3 +74,30 @@ def numbered(parent: Path, name: str) -> dict[int, Path]:
         if path.is_dir() and (match := re.fullmatch(r"_(\d+)(_[0-9a-f-]{36})?", path.name[len(name) :])):
             folders[int(match[1])] = path
     return folders
+
+
+def lock(path: Path) -> Any:
+    """
+    Lock a file, which is made if it does not exist, until it is closed.
+
+    :return: the open file; None if another process has locked it
+    """
+    file = path.open("a")
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        return None
+    if not is_file_at(file, path):  # removed by a process that has just finished
+        file.close()
+        return lock(path)
+    return file
+
+
+def is_file_at(file: Any, path: Path) -> bool:
+    """Return whether an open file is still the one at a path."""
+    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_tdc.common.files import is_file_at, lock
+
 Writer = Callable[[Path], Any]
 
 _FORMAT = 1
@@ -90,10 +92,10 @@ class Store:
         :raises LockedError: if another process writes there by now
         """
         (self.folder / _SHARED).mkdir(parents=True, exist_ok=True)
-        if not _is_file_at(self._lock, self._lock_file):
-            lock = _lock(self._lock_file)
+        if not is_file_at(self._lock, self._lock_file):
+            locked = _lock(self._lock_file)
             self._lock.close()
-            self._lock = lock
+            self._lock = locked
         return all((self.folder / _SHARED / name).is_file() for name in shared)
 
     def steps(self) -> list[int]:
@@ -285,21 +287,7 @@ def _sync_folder(path: Path) -> None:
 
 
 def _lock(path: Path) -> Any:
-    file = path.open("w")
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return file
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise LockedError(f"Another process writes resume states to {path.parent}") from None
-    if not _is_file_at(file, path):  # removed by a process that has just finished
-        file.close()
-        return _lock(path)
+    file = lock(path)
+    if file is None:
+        raise LockedError(f"Another process writes resume states to {path.parent}")
     return file
-
-
-def _is_file_at(file: Any, path: Path) -> bool:
-    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())

@@ -1,5 +1,6 @@
 """The λ search: its candidates and its ranking; then real searches, killed and resumed."""
 
+import contextlib
 import os
 import signal
 import time
@@ -112,6 +113,70 @@ def test_bad_arguments(arguments, sentence, tmp_path, capsys):
     assert stopped.value.code == 2
     assert sentence in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
+
+
+STORED = """
+{algo: tdc, env: Pendulum-v1, gym_packages: [], hyperparams: {}, n_timesteps: 90, seeds: 1, search: ["lam:[0.5]"],
+ samples: 10, asha: false, logs: logs, jobs: null, address: null, resume: null}
+"""
+
+
+@pytest.fixture
+def stopped_search(tmp_path, monkeypatch):
+    """The folder of a search; none is run."""
+    monkeypatch.setattr(tune, "cluster", lambda *args: contextlib.nullcontext())
+    monkeypatch.setattr(tune, "run_trials", lambda *args: (False, []))
+    (tmp_path / "search.yml").write_text(STORED)
+    return tmp_path
+
+
+def test_a_search_has_all_its_arguments_in_its_folder(stopped_search, capsys):
+    assert tune.main(["--resume", str(stopped_search)]) == 130
+    captured = capsys.readouterr()
+    assert captured.out.startswith("1 candidate × 1 seed, 90 steps each, evaluated every 3 (5 episodes)")
+    assert captured.err.endswith(f"tune --resume {stopped_search}\n")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (STORED, "", "search.yml must be a mapping of arguments to values"),
+        (STORED, "[1, 2]", "search.yml must be a mapping of arguments to values"),
+        ("{algo", "{{algo", "search.yml is not YAML of plain values"),
+        ("samples: 10, ", "", "search.yml: samples must be of type int, got None"),
+        ("n_timesteps: 90", "n_timesteps: many", "search.yml: n_timesteps must be of type int, got 'many'"),
+        ("algo: tdc", "algo: tcd", "search.yml: unknown algorithm 'tcd'; did you mean 'tdc'?"),
+        ('["lam:[0.5]"]', "[5]", "search.yml: search must hold texts, got [5]"),
+        ("hyperparams: {}", "hyperparams: {1: 2}", "search.yml: hyperparams must hold texts, got {1: 2}"),
+    ],
+)
+def test_a_damaged_search(stopped_search, old, new, sentence, capsys):
+    (stopped_search / "search.yml").write_text(STORED.replace(old, new))
+    with pytest.raises(SystemExit) as stopped:
+        tune.main(["--resume", str(stopped_search)])
+    assert stopped.value.code == 2
+    assert sentence in capsys.readouterr().err
+    assert [path.name for path in stopped_search.iterdir()] == ["search.yml"]
+
+
+def test_a_search_is_run_by_one_process(stopped_search, monkeypatch, capsys):
+    def resume_again(*args):
+        with pytest.raises(SystemExit):
+            tune.main(["--resume", str(stopped_search)])
+        return False, []
+
+    monkeypatch.setattr(tune, "run_trials", resume_again)
+    assert tune.main(["--resume", str(stopped_search)]) == 130
+    assert f"Another process runs the search in {stopped_search}" in capsys.readouterr().err
+    monkeypatch.setattr(tune, "run_trials", lambda *args: (True, []))
+    assert tune.main(["--resume", str(stopped_search)]) == 0  # it has let go of it
+
+
+def test_a_place_that_cannot_be_written_is_said_before_ray_is_started(tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit):
+        tune.main(["--env", "Pendulum-v1", "--logs", str(tmp_path / "file")])
+    assert f"cannot be written: {tmp_path}/file is not a folder" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------- real searches

@@ -1,0 +1,13 @@
+"""Numbers and lists in sentences."""
+
+from collections.abc import Sequence
+
+
+def count(n: int, noun: str) -> str:
+    """``count(1, "seed")`` → "1 seed", ``count(3, "seed")`` → "3 seeds"."""
+    return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
+
+
+def listed(words: Sequence[str]) -> str:
+    """``["a", "b", "c"]`` → "a, b and c"."""
+    return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else "".join(words)
