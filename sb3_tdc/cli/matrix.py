@@ -8,6 +8,8 @@ from pathlib import Path
 
 from sb3_tdc.cli.arguments import Names, Parser, one_of
 from sb3_tdc.common.commands import command
+from sb3_tdc.common.files import check_can_be_made
+from sb3_tdc.common.output import harmless_output
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.jobs import Job, cluster, count_cores
 from sb3_tdc.experiments.matrix import run_jobs
@@ -71,6 +73,7 @@ def _describe(args: argparse.Namespace, plan: Plan) -> None:
         )
 
 
+@harmless_output()
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Train the runs of a suite.
@@ -92,12 +95,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{len(plan.jobs) - len(to_run)} of {len(plan.jobs)} runs are finished already", flush=True)
         if not to_run:
             return 0
+        check_can_be_made("--logs", args.logs)
         with cluster(args.address, args.jobs) as ray:
             outcome = run_jobs(ray, to_run, args.jobs)
     except ValueError as error:
         parser.fail(error)
-    except KeyboardInterrupt:
-        return 130
     for sentence in outcome.failed:
         print(f"failed {sentence}", file=sys.stderr)
     if outcome.stopped:

@@ -5,6 +5,7 @@ One run of ``sb3-tdc train`` in its own folder and process: what the matrix and 
 import importlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -24,6 +25,7 @@ from sb3_tdc.runs.folder import RunFolder, folder_name
 from sb3_tdc.runs.settings import Role, defaults
 
 _POLL_SECONDS = 0.2
+_SECONDS_TO_ANSWER = 5.0
 _EVAL_FREQ: int = defaults(Role.EXPERIMENT)["eval_freq"]
 
 
@@ -194,6 +196,23 @@ def import_ray() -> Any:
         raise ValueError('Runs are distributed by Ray: pip install "sb3-tdc[tune]"') from error
 
 
+def check_address(address: str) -> None:
+    """
+    Check that something answers at the address of a cluster: Ray itself would try for minutes.
+
+    :raises ValueError: if it is no address, or nothing answers
+    """
+    if address in ("auto", "local"):  # Ray looks on this machine
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise ValueError(f"--address must be HOST:PORT, or auto for the cluster of this machine, got {address!r}")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), _SECONDS_TO_ANSWER).close()
+    except OSError as error:
+        raise ValueError(f"--address {address}: nothing answers there ({error.strerror or error})") from error
+
+
 @contextmanager
 def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
     """
@@ -204,6 +223,8 @@ def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
     :return: the module
     :raises ValueError: if Ray is not installed, or the cluster cannot be reached
     """
+    if address is not None:
+        check_address(address)
     os.environ.setdefault("RAY_worker_niceness", "0")  # workers, and so runs, are as nice as this process
     ray = import_ray()
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ import pytest
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import matrix
+from sb3_tdc.experiments import jobs as job_module
 from sb3_tdc.experiments import plan as planning
 from sb3_tdc.experiments.jobs import Job, eval_freq
 from sb3_tdc.experiments.results import find_runs
@@ -129,6 +131,10 @@ def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
         (["fig1", "--seeds", "0"], "at least 1"),
         (["fig1", "--jobs", "0"], "--jobs must be at least 1"),
         (["fig1", "--only", "ppo"], "not in the suite"),
+        (["figS1", "--address", "head"], "--address must be HOST:PORT, or auto for the cluster of this machine"),
+        (["figS1", "--address", ":6379"], "--address must be HOST:PORT"),
+        (["figS1", "--address", "localhost:65536"], "--address must be HOST:PORT"),
+        (["figS1", "--address", "nowhere.invalid:6379"], "--address nowhere.invalid:6379: nothing answers there"),
     ],
 )
 def test_bad_arguments(arguments, sentence, tmp_path, capsys):
@@ -137,6 +143,25 @@ def test_bad_arguments(arguments, sentence, tmp_path, capsys):
     assert stopped.value.code == 2
     assert sentence in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
+
+
+def test_an_address_is_tried_before_ray_does(monkeypatch):
+    monkeypatch.setattr(job_module, "import_ray", lambda: pytest.fail("Ray tries for minutes"))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        job_module.check_address(address)
+        job_module.check_address(f"ray://{address}")
+    with pytest.raises(ValueError, match=f"--address {address}: nothing answers there .Connection refused"):
+        with job_module.cluster(address, None):
+            pass
+
+
+def test_logs_that_cannot_be_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(matrix, "cluster", lambda *args: pytest.fail("it was started"))
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit):
+        matrix.main(["figS1", "--logs", str(tmp_path / "file" / "logs")])
+    assert f"--logs {tmp_path}/file/logs cannot be written: {tmp_path}/file is not a folder" in capsys.readouterr().err
 
 
 def test_without_ray(tmp_path, capsys, monkeypatch):
@@ -204,4 +229,4 @@ def test_a_run_keeps_the_niceness_of_the_matrix():
     code = "import os; os.nice(7); from sb3_tdc.cli import job; job.keep_niceness()"
     code += "; print(open('/proc/self/autogroup').read())"
     done = subprocess.run([sys.executable, "-c", code], start_new_session=True, capture_output=True, text=True)
-    assert done.stdout.strip().endswith("nice 7")
+    assert done.stdout.strip().endswith(f"nice {min(os.nice(0) + 7, 19)}")
