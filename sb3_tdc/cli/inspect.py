@@ -1,7 +1,6 @@
 """``sb3-tdc inspect FILE``: what a saved file holds, what of it is code, and whether it would be opened."""
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +9,8 @@ from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load.inspect import inspect
 from sb3_tdc.safe_load.run_files import check_arguments, check_imports
+
+_KINDS = "zip of a model, a pickle of VecNormalize statistics or of a replay buffer"
 
 
 def inspect_run(path: Path) -> tuple[list[str], bool]:
@@ -28,7 +29,10 @@ def inspect_run(path: Path) -> tuple[list[str], bool]:
     except ValueError as error:
         lines, is_good = [*lines, f"Refused: {escaped(str(error))}"], False
     for model in [model for model in (run.model, run.best_model) if model.exists()]:
-        described, opens = inspect(model)
+        try:
+            described, opens = inspect(model)
+        except ValueError as error:
+            described, opens = [f"Refused: {escaped(str(error))}"], False
         lines, is_good = [*lines, "", *described], is_good and opens
     return lines, is_good
 
@@ -41,12 +45,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: 0 if all would be opened, 1 if something is refused, 2 if it is no such file
     """
     parser = Parser("inspect", "Show what a saved file holds, what of it is code, and whether it would be opened.")
-    parser.add_argument("path", type=Path, help="zip of a model, VecNormalize statistics, replay buffer, or run folder")
+    parser.add_argument("path", type=Path, help=f"a {_KINDS}, or a run folder")
     path = parser.parse_args(argv).path
+    if not path.exists():
+        parser.fail(ValueError(f"{escaped(str(path))} does not exist"))
     try:
         lines, is_good = inspect_run(path) if path.is_dir() else inspect(path)
-    except (OSError, ValueError) as error:
-        print(f"error: {escaped(str(error))}", file=sys.stderr)
-        return 2
+    except ValueError as error:
+        expected = "" if path.is_dir() else f"; it must be a {_KINDS}"
+        parser.fail(ValueError(f"{escaped(str(error))}{expected}"))
     print("\n".join(lines))
     return 0 if is_good else 1

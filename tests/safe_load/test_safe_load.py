@@ -766,10 +766,29 @@ def test_statistics_buffers_and_folders_can_be_inspected(run, tmp_path, marker, 
     (tmp_path / "evil.pkl").write_bytes(pickle.dumps(Poison()))
     status, out = inspected(tmp_path / "evil.pkl", capsys)
     assert (status, "Refused: builtins.exec is not known here." in out) == (1, True)
-    assert inspect.main([str(tmp_path / "nothing")]) == 2
     with pytest.raises(SystemExit):
         inspect.main([])
     assert not marker.exists()
+
+
+def test_what_is_nothing_of_this_is_one_sentence(run, tmp_path, capsys):
+    (tmp_path / "text.txt").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    for name, sentence in (
+        ("nothing", "inspect: error: {path} does not exist\n"),
+        ("text.txt", "inspect: error: {path}: a damaged pickle; it must be a zip of a model, a pickle of VecNormalize"),
+        ("empty", "inspect: error: {path} is not the folder of a run: it has no <environment>/config.yml\n"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            inspect.main([str(tmp_path / name)])
+        assert stopped.value.code == 2
+        assert sentence.format(path=tmp_path / name) in capsys.readouterr().err
+
+    (run / "Hopper-v4.zip").write_bytes((run / "Hopper-v4.zip").read_bytes()[:-100])  # the best model is still shown
+    status, out = inspected(run, capsys)
+    assert status == 1
+    assert f"Refused: {run / 'Hopper-v4.zip'}: " in out
+    assert "Would be opened as a TDC of 300 steps." in out or "Would be opened as a TDC of 150 steps." in out
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if not name.startswith("ddpg")])
