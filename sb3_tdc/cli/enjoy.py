@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,12 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdc.advb.policies import AdvisedPolicy
+from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, add_settings
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.returns import steps_until_negligible
 from sb3_tdc.common.threads import set_threads
+from sb3_tdc.common.words import count
 from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
 from sb3_tdc.envs.registry import import_packages, split_env_id
@@ -45,6 +47,10 @@ _ZOO_FLAGS = {
     **dict.fromkeys(("-P", "--progress"), "every episode is printed as it ends"),
     "--render": "there is a window where there is a display; --record FILE.mp4 writes a video",
 }
+
+
+# Of a run's models
+_CHOICES = ("load_best", "load_checkpoint", "load_last_checkpoint")
 
 
 def make_parser() -> Parser:
@@ -120,22 +126,41 @@ def find_model(args: argparse.Namespace, run: RunFolder) -> Path:
     return path
 
 
-def find_trained(args: argparse.Namespace) -> TrainedModel:
+def find_trained(args: argparse.Namespace, given: Collection[str]) -> TrainedModel:
     """
     Return the model that the arguments name; for a zip outside a run, the algorithm and the environment are theirs.
 
-    :raises ValueError: if there is none
+    :param given: names of the arguments that are not defaults
+    :raises ValueError: if there is none, or the arguments contradict each other
     """
-    if args.run is not None and args.run.is_file():
-        try:
-            run, path = RunFolder.open(args.run.parent), args.run  # its run tells what it was trained with
-        except ValueError:
-            import_packages(args.gym_packages)
-            return open_zip(args.run, args.algo, args.env, args.trust)
+    if args.run is None:
+        run = find_run(args)
+        return open_run(run, find_model(args, run), args.gym_packages, args.trust)
+    for name in ("exp_id", "log_folder", *(_CHOICES if args.run.is_file() else ())):
+        if name in given:
+            raise ValueError(f"--{name.replace('_', '-')} chooses a model, and so does {args.run}: leave out one")
+    if args.run.is_file():
+        trained = _open_file(args, given)
     else:
         run = find_run(args)
-        path = find_model(args, run)
-    return open_run(run, path, args.gym_packages, args.trust)
+        trained = open_run(run, find_model(args, run), args.gym_packages, args.trust)
+    for name, found in (("algo", trained.algo), ("env", trained.env_id)):
+        if name in given and getattr(args, name) != found:
+            raise ValueError(f"--{name} {getattr(args, name)} contradicts {args.run}: it was trained with {found}")
+    return trained
+
+
+def _open_file(args: argparse.Namespace, given: Collection[str]) -> TrainedModel:
+    try:
+        run = RunFolder.open(args.run.parent)  # it tells what its models were trained with
+    except ValueError:
+        if "env" not in given:
+            raise ValueError(
+                f"{args.run} is not in the folder of a run: say with --env what it was trained on"
+            ) from None
+        import_packages(args.gym_packages)
+        return open_zip(args.run, args.algo, args.env, args.trust)
+    return open_run(run, args.run, args.gym_packages, args.trust)
 
 
 def play(model: BaseAlgorithm, env: VecEnv, args: argparse.Namespace, video: VideoWriter | None) -> list[float]:
@@ -160,7 +185,10 @@ def play(model: BaseAlgorithm, env: VecEnv, args: argparse.Namespace, video: Vid
                 episode = infos[0]["episode"]
                 returns.append(float(episode["r"]))
                 if args.verbose > 0:
-                    print(f"Episode {len(returns):>3}: return {episode['r']:10.2f}, {episode['l']} steps", flush=True)
+                    print(
+                        f"Episode {len(returns):>3}: return {episode['r']:10.2f}, {count(episode['l'], 'step')}",
+                        flush=True,
+                    )
     except KeyboardInterrupt:
         print("Stopped.")
     return returns
@@ -200,13 +228,14 @@ def check_explainable(args: argparse.Namespace, trained: TrainedModel) -> None:
 
     :raises ValueError: if there is nothing to explain, or an argument has no meaning with ``--explain``
     """
-    if trained.algo != "tdc":
-        raise ValueError(f"--explain needs a model of tdc: the critics of {trained.algo} predict no distribution")
-    for name in ("record", "stochastic"):
+    if not issubclass(ALGORITHMS[trained.algo], TDC):
+        known = " or ".join(name for name, algorithm in ALGORITHMS.items() if issubclass(algorithm, TDC))
+        raise ValueError(f"--explain needs a model of {known}: the critics of {trained.algo} predict no distribution")
+    for name in ("record", "stochastic", "board"):
         if getattr(args, name):
-            raise ValueError(f"--explain plays the mean action, without a picture: leave out --{name}")
-    if args.n_timesteps != -1 or args.n_episodes < 1:
-        raise ValueError("--explain needs whole episodes: --n-episodes at least 1, and no -n")
+            raise ValueError(f"--explain plays the actor's mean action, without a picture: leave out --{name}")
+    if args.n_timesteps != -1:
+        raise ValueError("--explain needs whole episodes: leave out -n")
 
 
 def extend_time_limit(trained: TrainedModel, env_kwargs: dict[str, Any]) -> tuple[int | None, dict[str, Any]]:
@@ -231,7 +260,7 @@ def explain(model: TDC, env: VecEnv, trained: TrainedModel, n_episodes: int, lim
     episodes = record_episodes(model, env, n_episodes, limit)
     unit = "normalised rewards, " if normalization is not None and normalization.norm_reward else ""
     title = (
-        f"TDC on {trained.env_id}, {model.num_timesteps:,} steps of training ({trained.path.name}), "
+        f"{type(model).__name__} on {trained.env_id}, {model.num_timesteps:,} steps of training ({trained.path.name}), "
         f"{unit}λ = {model.scheduled('lam'):g}, γ = {model.gamma:g}"
     )
     write_explanation(model, episodes, _explanation(trained), title)
@@ -275,14 +304,23 @@ def _choose_who_acts(model: BaseAlgorithm, args: argparse.Namespace) -> Abstract
     return nullcontext() if args.board else model.policy.actor_alone()
 
 
-def _play_or_explain(args: argparse.Namespace) -> int:
+def _check_numbers(args: argparse.Namespace) -> None:
+    """:raises ValueError: for one that is not allowed"""
+    if not 0 <= args.seed <= MAX_SEED:
+        raise ValueError(f"--seed must be 0 to {MAX_SEED}, got {args.seed}")
+    if args.n_episodes < 1:
+        raise ValueError(f"--n-episodes must be at least 1, got {args.n_episodes}")
+    if args.n_timesteps < 1 and args.n_timesteps != -1:
+        raise ValueError(f"-n must be at least 1 (or -1: no limit), got {args.n_timesteps}")
+
+
+def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
     args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
     if args.trust:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
-    if not 0 <= args.seed <= MAX_SEED:
-        raise ValueError(f"--seed must be 0 to {MAX_SEED}, got {args.seed}")
+    _check_numbers(args)
     set_threads(args.num_threads)
-    trained = find_trained(args)
+    trained = find_trained(args, given)
     set_random_seed(args.seed)
     env_kwargs = {**trained.env_kwargs, **args.env_kwargs}
     _check_outputs(args, trained)
@@ -302,7 +340,7 @@ def _play_or_explain(args: argparse.Namespace) -> int:
         model = trained.load(env, args.device)
         stack.enter_context(_choose_who_acts(model, args))
         env.seed(args.seed)  # loading has seeded it as for training
-        print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {model.num_timesteps:,} steps")
+        print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {count(model.num_timesteps, 'step')}")
         if args.explain:
             assert isinstance(model, TDC)
             explain(model, env, trained, args.n_episodes, limit)
@@ -311,7 +349,9 @@ def _play_or_explain(args: argparse.Namespace) -> int:
     if args.record is not None:
         print(f"Wrote {args.record}")
     if returns:
-        print(f"Return: {np.mean(returns):.2f} ± {np.std(returns):.2f} (mean ± std of {len(returns)} episodes)")
+        print(
+            f"Return: {np.mean(returns):.2f} ± {np.std(returns):.2f} (mean ± std of {count(len(returns), 'episode')})"
+        )
     return 0
 
 
@@ -331,8 +371,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: 0
     """
     parser = make_parser()
-    args = parser.parse_args(argv)
+    args, given = parser.parse_args(argv), parser.parse_given(argv)
     try:
-        return _play_or_explain(args)
+        return _play_or_explain(args, given)
     except (ValueError, ImportError, DependencyNotInstalled) as error:
         parser.fail(error)

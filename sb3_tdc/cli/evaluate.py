@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.common.words import count
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
 from sb3_tdc.experiments.results import find_runs
@@ -39,7 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         except Exception as error:  # one run must not stop the others
             failed.append(f"{run.folder.path}: {type(error).__name__}: {' '.join(str(error).split())}")
             continue
-        print(f"{run.folder.path}: {returns.mean():.1f} ± {returns.std():.1f} ({len(returns)} episodes)", flush=True)
+        print(
+            f"{run.folder.path}: {returns.mean():.1f} ± {returns.std():.1f} ({count(len(returns), 'episode')})",
+            flush=True,
+        )
     for sentence in failed:
         print(f"Failed: {sentence}", file=sys.stderr)
     return int(bool(failed))

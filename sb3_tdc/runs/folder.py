@@ -71,6 +71,8 @@ class RunFolder:
         :raises ValueError: if the folder is not one of a run
         """
         path = Path(path)
+        if not path.exists():
+            raise ValueError(f"{path} does not exist")
         configs = list(path.glob("*/config.yml"))
         if len(configs) != 1:
             raise ValueError(f"{path} is not the folder of a run: it has no <environment>/config.yml")

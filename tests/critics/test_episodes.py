@@ -332,7 +332,6 @@ def test_enjoy_explains_a_run(run, capsys):
         (["--record", "x.mp4"], "leave out --record"),
         (["--stochastic"], "leave out --stochastic"),
         (["-n", "5"], "--explain needs whole episodes"),
-        (["--n-episodes", "0"], "--explain needs whole episodes"),
     ],
 )
 def test_what_has_no_meaning_beside_explain_is_said(run, capsys, more, message):

@@ -1,0 +1,80 @@
+"""Which model ``enjoy`` takes, and what it does not take silently."""
+
+import shutil
+
+import pytest
+
+from sb3_tdc.cli import enjoy
+from tests.helpers.command_line import SMALL, run_enjoy, run_train
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    assert run_train(folder, "--verbose", 0, env="Pendulum-v1", n=210) == 0
+    return folder / "tdc" / "Pendulum-v1_1"
+
+
+@pytest.fixture
+def lone(run, tmp_path):
+    """A model that was taken out of its run."""
+    return shutil.copy(run / "Pendulum-v1.zip", tmp_path / "lone.zip")
+
+
+def refused(capsys, *arguments):
+    with pytest.raises(SystemExit) as stopped:
+        enjoy.main([*map(str, arguments), "--no-render"])
+    assert stopped.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    return captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--n-episodes", "0"], "--n-episodes must be at least 1, got 0"),
+        (["--n-episodes", "-3"], "--n-episodes must be at least 1, got -3"),
+        (["-n", "0"], "-n must be at least 1 (or -1: no limit), got 0"),
+        (["-n", "-2"], "-n must be at least 1 (or -1: no limit), got -2"),
+        (["--algo", "sac"], "--algo sac contradicts {run}: it was trained with tdc"),
+        (["--env", "Hopper-v4"], "--env Hopper-v4 contradicts {run}: it was trained with Pendulum-v1"),
+        (["--exp-id", "2"], "--exp-id chooses a model, and so does {run}: leave out one"),
+        (["-f", "elsewhere"], "--log-folder chooses a model, and so does {run}: leave out one"),
+    ],
+)
+def test_what_contradicts_a_run(run, arguments, sentence, capsys):
+    assert sentence.format(run=run) in refused(capsys, run, *arguments)
+
+
+def test_a_file_of_a_run_is_chosen_once(run, capsys):
+    model = run / "Pendulum-v1.zip"
+    assert f"--load-best chooses a model, and so does {model}" in refused(capsys, model, "--load-best")
+    assert "--env Hopper-v4 contradicts" in refused(capsys, model, "--env", "Hopper-v4")
+    assert run_enjoy(model, "--algo", "tdc", "--env", "Pendulum-v1") == 0  # it says the same
+
+
+def test_a_file_outside_a_run_says_nothing_of_its_environment(lone, capsys):
+    sentence = f"{lone} is not in the folder of a run: say with --env what it was trained on"
+    assert sentence in refused(capsys, lone)
+    assert run_enjoy(lone, "--env", "Pendulum-v1") == 0
+    assert "mean ± std of 2 episodes" in capsys.readouterr().out
+
+
+def test_a_file_that_is_not_there(tmp_path, capsys):
+    assert f"{tmp_path / 'missing.zip'} does not exist" in refused(capsys, tmp_path / "missing.zip")
+
+
+def test_one_episode_is_one(run, capsys):
+    assert enjoy.main([str(run), "--no-render", "--n-episodes", "1"]) == 0
+    assert capsys.readouterr().out.endswith("± 0.00 (mean ± std of 1 episode)\n")
+
+
+def test_the_critics_of_advb_tdc_are_explained_too(tmp_path, capsys):
+    assert run_train(tmp_path, "--verbose", 0, algo="advb_tdc", env="Pendulum-v1", n=210, small=SMALL) == 0
+    run = tmp_path / "advb_tdc" / "Pendulum-v1_1"
+    capsys.readouterr()
+    assert "leave out --board" in refused(capsys, run, "--explain", "--board")
+    assert enjoy.main([str(run), "--explain", "--n-episodes", "1"]) == 0
+    assert (run / "Pendulum-v1_critics.png").stat().st_size > 10_000
