@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-VIDEO_SUFFIXES = (".mp4", ".gif", ".webm", ".mkv", ".mov", ".avi")
+VIDEO_SUFFIXES = (".mp4", ".gif", ".mkv", ".mov", ".avi")
 _GL_BACKENDS = ("egl", "osmesa")
 _TRY_DISPLAY = "import sys, glfw; sys.exit(not glfw.init())"
 _TRY_BACKEND = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"

@@ -5,6 +5,7 @@ import os
 from typing import ClassVar
 
 import gymnasium as gym
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 
@@ -120,6 +121,17 @@ def test_every_environment_can_be_played(runs, name, said, monkeypatch, capsys):
 def test_what_draws_can_be_recorded(runs, name, tmp_path):
     assert enjoy.main([str(runs[name]), "--n-episodes", "1", "--record", str(tmp_path / "video.mp4")]) == 0
     assert (tmp_path / "video.mp4").stat().st_size > 100
+
+
+@pytest.mark.parametrize("suffix", rendering.VIDEO_SUFFIXES)
+def test_a_format_that_is_offered_can_be_written(tmp_path, suffix):
+    path = tmp_path / f"video{suffix}"
+    with rendering.VideoWriter(path, fps=10) as video:
+        for shade in range(0, 250, 50):
+            video.add(np.full((32, 32, 3), shade, np.uint8))
+    frames = list(imageio.get_reader(path).iter_data())
+    assert len(frames) == 5
+    assert frames[4].mean() == pytest.approx(200, abs=5)
 
 
 def test_what_does_not_draw_cannot_be_recorded_and_says_so(runs, tmp_path, capsys):
