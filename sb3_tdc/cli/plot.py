@@ -1,7 +1,5 @@
-"""``python -m sb3_tdc.cli.plot RUN [RUN ...]``: learning curves of runs, from their evaluations."""
+"""``sb3-tdc plot RUN [RUN ...]``: learning curves of runs, from their evaluations."""
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_tdc.cli.arguments import Parser
+from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.plots import import_figure, style_axes
 from sb3_tdc.runs.folder import RunFolder
@@ -36,17 +35,13 @@ def load_curve(run: RunFolder, until: int | None = None) -> Evaluated:
     Read the evaluations of a run.
 
     :param until: leave out those after this step
-    :raises ValueError: if the run has no evaluations
+    :raises ValueError: if the run has no evaluations, or they cannot be read
     """
     path = run.path / "evaluations.npz"
     if not path.is_file():
         raise ValueError(f"{path} does not exist: the run has not been evaluated yet")
     args = run.args
-    try:
-        with np.load(path) as evaluations:
-            timesteps, returns = evaluations["timesteps"], evaluations["results"]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+    timesteps, returns = read_arrays(path, "timesteps", "results")
     shown = timesteps <= (np.inf if until is None else until)
     if not shown.any():
         raise ValueError(f"{path} has no evaluation until step {until:,}, the first is at step {timesteps[0]:,}")

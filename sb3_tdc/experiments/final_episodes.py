@@ -4,8 +4,6 @@ Episode i begins with the evaluation seed 10,000 + i in every run, so that algor
 """
 
 import hashlib
-import zipfile
-import zlib
 from collections.abc import Sequence
 from contextlib import closing
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.files import check_writable, write_atomically
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.runs.trained import open_run
@@ -62,12 +61,11 @@ def read_test_returns(run: Run) -> np.ndarray | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path) as saved:
-            # Published results have no model that could have changed
-            is_of_model = not run.folder.model.is_file() or str(saved["checksum"]) == checksum(run)
-            return saved["returns"] if is_of_model else None
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):  # played again
+        tested, returns = read_arrays(path, "checksum", "returns")
+    except ValueError:  # played again
         return None
+    # Published results have no model that could have changed
+    return returns if not run.folder.model.is_file() or str(tested) == checksum(run) else None
 
 
 def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
@@ -122,8 +123,7 @@ class Run:
         path = self.folder.path / "evaluations.npz"
         if not path.is_file():
             return None
-        with np.load(path) as saved:
-            return Evaluations(saved["timesteps"], saved["results"])
+        return Evaluations(*read_arrays(path, "timesteps", "results"))
 
     def progress(self, *columns: str) -> np.ndarray:
         """
