@@ -13,6 +13,10 @@ from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.plots import import_figure, style_axes
 from sb3_tdc.runs.folder import RunFolder
 
+# More labels would cover the curves
+_LABELS_INSIDE = 4
+_LABELS_IN_A_COLUMN = 16
+
 
 @dataclass(frozen=True)
 class Evaluated:
@@ -59,10 +63,12 @@ def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
         (line,) = axes.plot(curve.timesteps, curve.returns.mean(axis=1), label=curve.label)
         steps = np.repeat(curve.timesteps, curve.returns.shape[1])
         axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
-    episodes = ", ".join(sorted({str(curve.returns.shape[1]) for curve in curves}))
-    style_axes(axes, curves[0].env_id, "environment steps", f"return of {episodes} mean-action episodes")
+    numbers = sorted({curve.returns.shape[1] for curve in curves})
+    episodes = f"{', '.join(map(str, numbers))} mean-action episode{'' if numbers == [1] else 's'}"
+    style_axes(axes, curves[0].env_id, "environment steps", f"return of {episodes}")
     axes.xaxis.set_major_formatter("{x:,.0f}")
-    axes.legend(frameon=False)
+    outside = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "ncols": -(-len(curves) // _LABELS_IN_A_COLUMN)}
+    axes.legend(frameon=False, **(outside if len(curves) > _LABELS_INSIDE else {}))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -78,21 +84,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--until", type=int, metavar="STEP", help="leave out evaluations after this step")
     args = parser.parse_args(argv)
     try:
-        check_writable("-o", args.output)
         curves = [load_curve(RunFolder.open(run), args.until) for run in args.runs]
         if len({curve.env_id for curve in curves}) > 1:
             raise ValueError("The runs must be of one environment; draw one figure for each")
-    except ValueError as error:
+        figure = import_figure()(figsize=(7, 4), layout="constrained")
+        kinds = sorted(figure.canvas.get_supported_filetypes())
+        if args.output.suffix.removeprefix(".") not in kinds:
+            raise ValueError(f"-o {args.output}: the name must end in one of .{', .'.join(kinds)}")
+        check_writable("-o", args.output)
+    except (ValueError, ImportError) as error:
         parser.fail(error)
-    try:
-        figure_class = import_figure()
-    except ImportError as error:
-        parser.fail(error)
-
-    figure = figure_class(figsize=(7, 4), layout="constrained")
-    kinds = sorted(figure.canvas.get_supported_filetypes())
-    if args.output.suffix.removeprefix(".") not in kinds:
-        parser.fail(ValueError(f"-o {args.output}: the name must end in one of .{', .'.join(kinds)}"))
     draw_curves(figure.subplots(), curves)
     figure.savefig(args.output, dpi=150)
     print(f"Wrote {args.output}")

@@ -45,6 +45,26 @@ def test_a_figure_of_several_runs(tmp_path, capsys):
     assert str(file) in capsys.readouterr().out
 
 
+def test_one_episode_is_one():
+    axes = figure.Figure().subplots()
+    plot.draw_curves(axes, [plot.Evaluated("tdc", "A-v0", np.array([1]), np.array([[2.0]]))])
+    assert axes.get_ylabel() == "return of 1 mean-action episode"
+
+
+@pytest.mark.parametrize("n_curves", [5, 8, 30])
+def test_the_legend_of_many_curves_is_outside(n_curves):
+    drawn = figure.Figure(figsize=(7, 4), layout="constrained")
+    axes = drawn.subplots()
+    curve = plot.Evaluated("advb_tdc, seed 1", "A-v0", np.array([1, 2]), np.array([[2.0], [3.0]]))
+    plot.draw_curves(axes, [curve] * n_curves)
+    drawn.draw_without_rendering()
+    legend = axes.get_legend().get_window_extent()
+    assert legend.x0 >= axes.get_window_extent().x1
+    assert legend.x1 <= drawn.bbox.x1
+    assert (legend.y0 >= drawn.bbox.y0, legend.y1 <= drawn.bbox.y1) == (True, True)
+    assert axes.get_window_extent().width > drawn.bbox.width / 3
+
+
 def test_what_cannot_be_drawn_is_said(tmp_path, capsys):
     a, b = make_run(tmp_path), make_run(tmp_path, "B-v0")
     none = make_run(tmp_path, evaluated=False)
@@ -52,8 +72,12 @@ def test_what_cannot_be_drawn_is_said(tmp_path, capsys):
         ([a, b], "The runs must be of one environment"),
         ([none], "the run has not been evaluated yet"),
         ([tmp_path], "is not the folder of a run"),
+        ([tmp_path / "nothing"], "nothing does not exist"),
     ):
         with pytest.raises(SystemExit):
-            plot.main([*map(str, runs), "-o", str(tmp_path / "x.png")])
+            plot.main([*map(str, runs), "-o", str(tmp_path / "figures" / "x.png")])
         assert message in capsys.readouterr().err
-    assert not (tmp_path / "x.png").exists()
+    with pytest.raises(SystemExit):
+        plot.main([str(a), "-o", str(tmp_path / "figures" / "x.doc")])
+    assert "x.doc: the name must end in one of ." in capsys.readouterr().err
+    assert not (tmp_path / "figures").exists()
