@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tdc.common.words import count
 from sb3_tdc.experiments.jobs import Job, eval_freq, stop
 from sb3_tdc.experiments.results import Run
 
@@ -130,4 +131,4 @@ def make_trials(
 
     if not side_by_side:
         return {name(job, f"seed {job.seed}"): [job] for jobs in candidates for job in jobs}
-    return {name(jobs[0], f"{len(jobs)} seeds"): jobs for jobs in candidates}
+    return {name(jobs[0], count(len(jobs), "seed")): jobs for jobs in candidates}

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import sys
 import time
 
 import gymnasium as gym
@@ -90,6 +91,7 @@ def test_trials(tmp_path):
         "lam 0.0, 2 seeds": candidates[0],
         "lam 1.0, 2 seeds": candidates[1],
     }
+    assert list(trials.make_trials([candidates[0][:1]], ["lam"], side_by_side=True)) == ["lam 0.0, 1 seed"]
 
 
 @pytest.mark.parametrize(
@@ -170,6 +172,15 @@ def test_a_search_is_run_by_one_process(stopped_search, monkeypatch, capsys):
     assert f"Another process runs the search in {stopped_search}" in capsys.readouterr().err
     monkeypatch.setattr(tune, "run_trials", lambda *args: (True, []))
     assert tune.main(["--resume", str(stopped_search)]) == 0  # it has let go of it
+
+
+def test_a_closed_pipe_ends_no_search(stopped_search, monkeypatch, capsys):
+    """As with ``tune ... | tee log`` and Ctrl-C, which ends ``tee`` first."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writer, "w"))
+    assert tune.main(["--resume", str(stopped_search)]) == 130
+    assert "To continue:" in capsys.readouterr().err
 
 
 def test_a_place_that_cannot_be_written_is_said_before_ray_is_started(tmp_path, capsys):
