@@ -19,7 +19,7 @@ _FILES = ("evaluations.npz", test_returns.FILE)
 _SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
 # Rows of the log; more show the same curve
 _ROWS = 150
-_COLUMNS = ("time/", "train/", "eval/", "rollout/ep_rew_mean")
+_COLUMNS = ("time/", "train/", "eval/", "board/", "rollout/ep_rew_mean")
 _LEFT_OUT = ("time/fps", "time/episodes", "time/critics_elapsed")
 
 
@@ -27,17 +27,17 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     """
     Copy the small files of a finished run; its log thinned, its paths relative to ``logs``.
 
+    What an earlier copy had and the run no longer has is removed: test returns may be those of another model.
+
     :return: where they are
     """
     source, place = run.folder, folder / run.folder.path.relative_to(logs)
     target = place / source.env_name
     target.mkdir(parents=True, exist_ok=True)
     for name in _FILES:
-        if (source.path / name).is_file():
-            shutil.copyfile(source.path / name, place / name)
+        _mirror(source.path / name, place / name)
     for name in _SETTINGS:
-        if (source.path / source.env_name / name).is_file():
-            shutil.copyfile(source.path / source.env_name / name, target / name)
+        _mirror(source.path / source.env_name / name, target / name)
     relative = str(place.relative_to(folder).parents[1])
     arguments = {**source.args, "log_folder": relative}
     (target / "args.yml").write_text(plain_yaml.dump(arguments))
@@ -46,6 +46,14 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     log = pd.read_csv(source.path / "progress.csv")
     _thin(log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
     return place
+
+
+def _mirror(source: Path, target: Path) -> None:
+    """Copy a file, or remove the copy of one that is no longer there."""
+    if source.is_file():
+        shutil.copyfile(source, target)
+    else:
+        target.unlink(missing_ok=True)
 
 
 def _without_programs(command: str) -> str:

@@ -111,3 +111,14 @@ def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
 )
 def test_commands_name_no_folders_of_programs(command, published):
     assert publishing._without_programs(command) == published
+
+
+def test_test_returns_of_another_model_do_not_stay(logs, tmp_path):
+    copy, results = tmp_path / "logs", tmp_path / "results"
+    shutil.copytree(logs, copy)
+    publish.main([str(copy), "-o", str(results)])
+    assert len(list(results.rglob(final_episodes.FILE))) == 1
+    next(copy.rglob(final_episodes.FILE)).unlink()
+    publish.main([str(copy), "-o", str(results)])
+    assert list(results.rglob(final_episodes.FILE)) == []
+    assert len(list(results.rglob("evaluations.npz"))) == 1
