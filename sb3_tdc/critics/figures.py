@@ -10,6 +10,7 @@ import torch as th
 
 from sb3_tdc.common.plots import import_figure, style_axes
 from sb3_tdc.common.returns import TOLERANCE
+from sb3_tdc.common.words import count
 from sb3_tdc.critics.episodes import Episode, pool, rank_correlation, spread_and_errors, summarise
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.lam import critical_lam
@@ -62,7 +63,9 @@ def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
                 lw=1.8,
                 label=f"critic {critic + 1}",
             )
-    style_axes(axes, f"Calibration, {_count(known)}", "quantile level", "returns at or below the quantile")
+    style_axes(
+        axes, f"Calibration, {count(len(known), 'episode')}", "quantile level", "returns at or below the quantile"
+    )
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
     if known:
         axes.legend(frameon=False, fontsize="small")
@@ -81,7 +84,7 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
             mean = known.mean()
             label = f"critic {critic + 1}: {mean:+.3g}"
             axes.axhline(mean, ls=_STYLES[critic % 2], color=color, lw=1.8, label=label)
-    style_axes(axes, f"Overestimation, {_count(episodes)}", "step", "predicted mean − realised")
+    style_axes(axes, f"Overestimation, {count(len(episodes), 'episode')}", "step", "predicted mean − realised")
     if any(np.isfinite(episode.returns).any() for episode in episodes):
         axes.legend(frameon=False, fontsize="small")
 
@@ -99,7 +102,7 @@ def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
         label = "critic {}, rank correlation {:+.2f}, without bias {:+.2f}".format(critic + 1, *correlations)
         means = np.array([(std[tenth].mean(), error[tenth].mean()) for tenth in tenths]).reshape(-1, 2)
         axes.plot(*means.T, _STYLES[critic % 2], color=color, lw=1.8, label=label)
-    title = f"Does σ mean uncertainty? {_count(episodes)}"
+    title = f"Does σ mean uncertainty? {count(len(episodes), 'episode')}"
     style_axes(axes, title, "σ of the predicted return", "|realised − predicted mean|")
     if known:
         axes.legend(frameon=False, fontsize="small")
@@ -115,7 +118,7 @@ def draw_lam(axes: Any, episodes: Sequence[Episode], lam: float) -> None:
     axes.axhline(possible, color="grey", ls=":", lw=1, label=f"any λ: {possible:.0%}")
     share = (thresholds < lam).mean()
     axes.axvline(lam, color=_COLORS[1], lw=1.2, label=f"λ = {lam:g}: {share:.0%}")
-    style_axes(axes, f"What λ changes, {_count(episodes)}", "λ", "steps with another choice than λ = 0")
+    style_axes(axes, f"What λ changes, {count(len(episodes), 'episode')}", "λ", "steps with another choice than λ = 0")
     axes.set(xlim=(0, grid[-1]), ylim=(-0.02, 1.02))
     axes.legend(frameon=False, fontsize="small")
 
@@ -177,11 +180,7 @@ def write_explanation(model: TDC, episodes: Sequence[Episode], stem: Path, title
     for suffix in (".png", ".pdf"):
         figure.savefig(f"{stem}{suffix}", dpi=150)
     for name, value in summarise(episodes).items():
-        print(f"{name.replace('_', ' ').capitalize()}: {value:.4g} ({_count(episodes)})")
+        print(f"{name.replace('_', ' ').capitalize()}: {value:.4g} ({count(len(episodes), 'episode')})")
     if not summarise(episodes):
         print("No discounted return is known: the episodes end by a time limit before the discount has faded.")
     print(f"Wrote {stem}.png and .pdf")
-
-
-def _count(episodes: Sequence[Episode]) -> str:
-    return f"{len(episodes)} episode{'s' * (len(episodes) != 1)}"

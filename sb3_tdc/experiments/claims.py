@@ -2,22 +2,27 @@
 The paper's claims, each against the runs that are there: what is compared, on which numbers, and the verdict.
 
 A verdict needs 95 % intervals over seeds that do not overlap; anything else is undecided. One seed decides nothing.
+A claim is examined on the tasks that the paper makes it for.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.results import Group, Run, differences, vary
+from sb3_tdc.experiments.groups import Group, by_conditions, is_as_shipped, vary
+from sb3_tdc.experiments.results import Run
+from sb3_tdc.experiments.suites import MUJOCO, PYBULLET
 
-RIVALS = ("td3", "sac", "meow")
+RIVALS = ("td3", "sac", "meow", "ddpg")
 # The χ² interval is of normal values. Where some seeds leave a plateau and others do not, three seeds of one and the
 # same law would be told apart in a fifth of all cases, and ten in a hundredth
 MIN_SEEDS_OF_SPREAD = 10
-# Heads are interchangeable if they differ by at most this share of the larger mean
+# Two returns are the same, or comparable, if they differ by at most this share of the larger mean
 _SAME = 0.1
+# The paper's "larger λ" of Fig. 3
+_LARGE_LAM = 0.75
 
 
 @dataclass(frozen=True)
@@ -47,13 +52,13 @@ class Claim:
     One comparison.
 
     :param says: what the paper claims
+    :param group: of our side: task and number of steps are those of both
     :param what: the quantity that is compared
     :param ours: of the side that the claim favours; :param other: of the other side
     """
 
     says: str
-    env_id: str
-    n_timesteps: int
+    group: Group
     what: str
     sides: tuple[str, str]
     ours: Interval
@@ -82,44 +87,62 @@ def judge_spread(ours: Interval, other: Interval) -> str:
     return judge_smaller(ours, other)
 
 
+def judge_at_least(ours: Interval, other: Interval) -> str:
+    """Return the verdict on the claim that ours is the larger one, or less than a tenth smaller."""
+    if not (ours.is_known and other.is_known):
+        return "undecided: too few seeds"
+    if ours.low >= other.high - _margin(ours, other):
+        return "held"
+    return "not held" if other.is_above(ours) else "undecided"
+
+
 def judge_same(ours: Interval, other: Interval) -> str:
     """Return the verdict on the claim that both are the same, within a tenth of the larger mean."""
     if not (ours.is_known and other.is_known):
         return "undecided: too few seeds"
-    margin = _SAME * max(abs(ours.value), abs(other.value))
+    margin = _margin(ours, other)
     nearest = max(ours.low - other.high, other.low - ours.high)
     farthest = max(ours.high - other.low, other.high - ours.low)
     return "held" if farthest <= margin else "not held" if nearest > margin else "undecided"
 
 
+def _margin(ours: Interval, other: Interval) -> float:
+    return _SAME * max(abs(ours.value), abs(other.value))
+
+
 # ---------------------------------------------------------------- quantities
 
 
-def final_return(runs: Sequence[Run]) -> Interval:
-    """Return the mean over seeds of the last evaluation, with Student's interval."""
-    return _mean([statistics.final_return(run.evaluations.returns) for run in runs if run.evaluations])
+def late_return(group: Group) -> Interval:
+    """Return the mean over seeds of the evaluations in the last third, with Student's interval."""
+    return _mean(group.late_returns)
 
 
-def spread_of_seeds(runs: Sequence[Run]) -> Interval:
-    """Return the standard deviation of final returns over seeds, with the χ² interval of normal values."""
-    values = np.array([statistics.final_return(run.evaluations.returns) for run in runs if run.evaluations])
+def spread_of_seeds(group: Group) -> Interval:
+    """Return the standard deviation of late returns over seeds, with the χ² interval of normal values."""
+    values = group.late_returns
     low, high = statistics.spread_interval(values)
     return Interval(statistics.spread(values), low, high, len(values))
 
 
-def late_spread(runs: Sequence[Run]) -> Interval:
-    """Return how much the evaluations of one run differ late in training: their standard deviation, mean over seeds."""
-    return _mean([_std_of_late_evaluations(run) for run in runs])
+def late_spread(group: Group) -> Interval:
+    """Return how much the evaluations of one run scatter late in training, mean over seeds."""
+    return _mean([_scatter_of_late_evaluations(run) for run in group.finished])
 
 
-def late_td_error_variance(runs: Sequence[Run]) -> Interval:
+def late_td_error_variance(group: Group) -> Interval:
     """Return log10 of the variance of TD errors late in training, mean over seeds."""
-    return _mean([_log_of_late_td_errors(run) for run in runs])
+    return _mean([_log_of_late_td_errors(run) for run in group.finished])
 
 
-def _std_of_late_evaluations(run: Run) -> float:
+def _scatter_of_late_evaluations(run: Run) -> float:
+    """The standard deviation about a straight line: a run that still improves does not scatter for that."""
     late = run.late_evaluations()
-    return float(np.std(late, ddof=1)) if len(late) > 1 else float("nan")
+    if len(late) < 3:
+        return float("nan")
+    steps = np.arange(len(late))
+    residuals = late - np.polynomial.Polynomial.fit(steps, late, 1)(steps)
+    return float(np.sqrt((residuals**2).sum() / (len(late) - 2)))
 
 
 def _log_of_late_td_errors(run: Run) -> float:
@@ -128,7 +151,7 @@ def _log_of_late_td_errors(run: Run) -> float:
     return float(np.log10(late).mean()) if len(late) else float("nan")
 
 
-def _mean(values: Sequence[float]) -> Interval:
+def _mean(values: Iterable[float]) -> Interval:
     known = np.array([value for value in values if np.isfinite(value)])
     if not len(known):
         return Interval(np.nan, np.nan, np.nan, 0)
@@ -138,82 +161,78 @@ def _mean(values: Sequence[float]) -> Interval:
 
 # ---------------------------------------------------------------- claims
 
-Quantity = tuple[str, Callable[[Sequence[Run]], Interval]]
-_RETURN: Quantity = ("final return", final_return)
-_SEEDS: Quantity = ("standard deviation of final returns over seeds", spread_of_seeds)
-_LATE_SPREAD: Quantity = ("standard deviation of a run's evaluations in its last third", late_spread)
+Quantity = tuple[str, Callable[[Group], Interval]]
+Verdict = Callable[[Interval, Interval], str]
+_RETURN: Quantity = ("mean return in the last third", late_return)
+_SEEDS: Quantity = ("standard deviation of that mean over seeds", spread_of_seeds)
+_LATE_SPREAD: Quantity = ("scatter of a run's evaluations in its last third, about their trend", late_spread)
 _TD_ERRORS: Quantity = ("log10 of the variance of TD errors in the last third", late_td_error_variance)
+
+_INTERCHANGEABLE = "4. The heads are interchangeable"
+# Ours is the stochastic head
+_HEADS: dict[str, tuple[str, Verdict]] = {
+    "HalfCheetah-v4": (_INTERCHANGEABLE, judge_same),
+    "Humanoid-v4": (_INTERCHANGEABLE, judge_same),
+    "Hopper-v4": (_INTERCHANGEABLE, judge_same),
+    "Ant-v4": ("4. Ant favours the deterministic head", judge_smaller),
+    "Walker2d-v4": ("4. Walker2d favours the stochastic head", judge),
+}
 
 
 def examine(groups: Sequence[Group]) -> list[Claim]:
-    """Compare what there is for each claim, on every task and number of steps, in the order of the claims."""
+    """Compare what there is for each claim, in the order of the claims, on every task and number of steps."""
     claims = (_returns, _variances, _lambdas, _heads, _td_errors)
-    return [compared for claim in claims for compared in claim(groups)]
+    under_conditions = by_conditions((g for g in groups if g.finished), (*MUJOCO, *PYBULLET)).values()
+    return [compared for claim in claims for alike in under_conditions for compared in claim(alike)]
 
 
 def _returns(groups: Sequence[Group]) -> Iterator[Claim]:
     for plain, rival in _rivals(groups):
-        yield _claim("1. λ-LCB has higher final returns", _RETURN, plain, rival, judge)
+        yield _claim("1. λ-LCB has the highest return, or a comparable one", _RETURN, plain, rival, judge_at_least)
 
 
 def _variances(groups: Sequence[Group]) -> Iterator[Claim]:
     for plain, rival in _rivals(groups):
-        for quantity in (_SEEDS, _LATE_SPREAD):
-            yield _claim("2. λ-LCB varies less", quantity, plain, rival, judge_spread)
+        yield _claim("2. λ-LCB varies less", _SEEDS, plain, rival, judge_spread)
+        yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, rival, judge_smaller)
 
 
 def _lambdas(groups: Sequence[Group]) -> Iterator[Claim]:
-    for larger, smaller in _pairs_of(groups, "lam"):
-        yield _claim("3. A larger λ tightens the bands", _SEEDS, larger, smaller, judge_spread)
+    for some in _ablations(groups, "lam", "Humanoid-v4", "HalfCheetah-v4"):
+        numbers = [group for group in some if not isinstance(group.setting("lam"), str)]
+        if len(numbers) > 1 and numbers[0].setting("lam") < _LARGE_LAM <= numbers[-1].setting("lam"):
+            yield _claim("3. A larger λ tightens the bands", _SEEDS, numbers[-1], numbers[0], judge_spread)
 
 
 def _heads(groups: Sequence[Group]) -> Iterator[Claim]:
-    for stochastic, deterministic in _pairs_of(groups, "stochastic_actor"):
-        yield _claim("4. The heads are interchangeable", _RETURN, stochastic, deterministic, judge_same)
+    for deterministic, stochastic in _ablations(groups, "stochastic_actor", *_HEADS):
+        says, verdict = _HEADS[deterministic.env_id]
+        yield _claim(says, _RETURN, stochastic, deterministic, verdict)
 
 
 def _td_errors(groups: Sequence[Group]) -> Iterator[Claim]:
-    for larger, smaller in _pairs_of(groups, "lam"):
-        if larger.env_id.startswith("Hopper-v") and smaller.setting("lam") == 0:
-            yield _claim("5. λ lowers the variance of TD errors on Hopper", _TD_ERRORS, larger, smaller, judge_smaller)
+    for some in _ablations(groups, "lam", "Hopper-v4"):
+        of_lam = {group.setting("lam"): group for group in some}
+        if {0, 1} <= set(of_lam):
+            yield _claim("5. λ = 1 lowers the variance of TD errors", _TD_ERRORS, of_lam[1], of_lam[0], judge_smaller)
 
 
 def _rivals(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
-    """Pairs of TDC and a rival, both as ``hyperparams/`` has them."""
-    as_shipped = [group for group in groups if group.finished and _is_as_shipped(group)]
-    for plain in as_shipped:
-        for rival in as_shipped if plain.algo == "tdc" else ():
-            if rival.algo in RIVALS and _is_alike(plain, rival):
-                yield plain, rival
+    """Pairs of TDC and a rival on a task of the paper, both as ``hyperparams/`` has them."""
+    as_shipped = [group for group in groups if group.is_as_shipped and group.env_id in (*MUJOCO, *PYBULLET)]
+    for plain in (group for group in as_shipped if group.algo == "tdc"):
+        for rival in (group for group in as_shipped if group.algo in RIVALS):
+            yield plain, rival
 
 
-def _is_as_shipped(group: Group) -> bool:
-    """Return whether a group has the hyperparameters of ``hyperparams/``, but for its length and its warm-up."""
-    differing = differences(group.runs[0])
-    warm_up = differing.pop("learning_starts", None)
-    return not set(differing) - {"n_timesteps", "eval_freq", "mujoco"} and warm_up in (None, group.n_timesteps // 10)
-
-
-def _pairs_of(groups: Sequence[Group], key: str) -> Iterator[tuple[Group, Group]]:
-    """Pairs of TDC that differ in one number or switch alone: the largest and the smallest."""
-    of_tdc = [group for group in groups if group.algo == "tdc" and group.finished]
-    for some in vary(of_tdc, key):
-        numbers = sorted((g for g in some if not isinstance(g.setting(key), str)), key=lambda g: float(g.setting(key)))
-        if len(numbers) > 1:
-            yield numbers[-1], numbers[0]
-
-
-def _is_alike(one: Group, other: Group) -> bool:
-    """Return whether two groups may be compared: the same task, length and physics."""
-    return (
-        all(one.setting(key) == other.setting(key) for key in ("n_timesteps", "mujoco")) and one.env_id == other.env_id
+def _ablations(groups: Sequence[Group], key: str, *env_ids: str) -> list[list[Group]]:
+    """TDC as ``hyperparams/`` has it, but for one setting: ordered by it."""
+    return vary(
+        (g for g in groups if g.algo == "tdc" and g.env_id in env_ids and is_as_shipped(g.runs[0], but={key})), key
     )
 
 
-def _claim(
-    says: str, quantity: Quantity, ours: Group, other: Group, verdict: Callable[[Interval, Interval], str]
-) -> Claim:
+def _claim(says: str, quantity: Quantity, ours: Group, other: Group, verdict: Verdict) -> Claim:
     what, measure = quantity
-    intervals = measure(ours.finished), measure(other.finished)
-    sides = ours.label, other.label
-    return Claim(says, ours.env_id, ours.n_timesteps, what, sides, *intervals, verdict(*intervals))
+    intervals = measure(ours), measure(other)
+    return Claim(says, ours, what, (ours.label, other.label), *intervals, verdict(*intervals))

@@ -5,28 +5,27 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.experiments import figures, statistics
-from sb3_tdc.experiments.results import Group, Run
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.experiments.ablations import ABLATIONS
+from sb3_tdc.experiments.groups import Group
+from sb3_tdc.experiments.results import Run
 
 _BIN = 20_000  # environment steps, at the paper's scale
 
 
 def headline(groups: Sequence[Group]) -> list[Group]:
-    """Of one environment: each algorithm as its hyperparameter file has it; where it has not been run so, all of it."""
-    plain = {group.algo for group in groups if group.label == group.algo.upper()}
-    return [group for group in groups if group.label == group.algo.upper() or group.algo not in plain]
+    """
+    Choose what a figure on algorithms shows, of groups under the same conditions.
 
-
-def published_steps(algo: str, env_id: str) -> int:
-    """Return environment steps of the hyperparameter file, those of the paper for its tasks."""
-    return read_entry(hyperparams_file(algo), env_id)[0]["n_timesteps"]
+    Each algorithm as ``hyperparams/`` has it; where it has not been run so, all of it. Ablations have their own figure.
+    """
+    shipped = {group.algo for group in groups if group.is_as_shipped}
+    return [g for g in groups if g.algo not in ABLATIONS and (g.is_as_shipped or g.algo not in shipped)]
 
 
 def bin_width(group: Group) -> int:
     """20,000 steps, scaled; a multiple of the distance of evaluations, so that every bin has as many."""
-    scale = group.n_timesteps / published_steps(group.algo, group.env_id) if group.algo in ALGORITHMS else 1.0
+    scale = group.n_timesteps / group.shipped_steps if group.shipped_steps else 1.0
     frequency = max(group.setting("eval_freq") or 0, 1)
     return max(round(_BIN * scale / frequency), 1) * frequency
 

@@ -13,7 +13,8 @@ import pandas as pd
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.versions import commit_of_the_code, processor_name
-from sb3_tdc.experiments.results import Group, Run, describe, differences
+from sb3_tdc.experiments.groups import Group, describe, differences
+from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import PAPER, Cell
 from sb3_tdc.experiments.tables import number
 
@@ -39,9 +40,7 @@ def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
         )
         for cell in cells:
             members = [run for run in runs if cell.includes(run)]
-            done = len({run.seed for run in members if run.is_finished})
-            others = len({run.seed for run in members if not run.is_finished})
-            table.loc[cell.env_id, _column(cell)] = f"{done or '–'}" + (f" (+ {others} unfinished)" if others else "")
+            table.loc[cell.env_id, _column(cell)] = _count_seeds(members)
             if not members:
                 envs = absent.setdefault(_why_absent(cell), {}).setdefault(_column(cell), [])
                 envs += [cell.env_id] if cell.env_id not in envs else []
@@ -51,6 +50,17 @@ def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
         for why, cells in absent.items()
     ]
     return [*found, ("Absent runs", pd.DataFrame(rows, columns=["Why", "Absent"]))]
+
+
+def _count_seeds(runs: Sequence[Run]) -> str:
+    """``"3 (300,000 steps), 1 (100,000 steps), 2 unfinished"``; "–" without any."""
+    seeds: dict[int, set[int]] = {}
+    for run in runs:
+        if run.is_complete:
+            seeds.setdefault(run.n_timesteps, set()).add(run.seed)
+    said = [f"{len(seeds[steps])} ({steps:,} steps)" for steps in sorted(seeds, reverse=True)]
+    unfinished = sum(not run.is_finished for run in runs)
+    return ", ".join([*said, *([f"{unfinished} unfinished"] if unfinished else [])]) or "–"
 
 
 def _column(cell: Cell) -> str:
@@ -92,6 +102,7 @@ def describe_groups(groups: Sequence[Group]) -> pd.DataFrame:
                 "Algorithm": group.label,
                 "Steps": f"{group.n_timesteps:,}",
                 "Finished seeds": group.seeds,
+                "Commits of sb3_tdc": ", ".join(commit[:7] or "not known" for commit in group.commits) or "–",
                 "Differs from hyperparams/": describe(differences(group.runs[0])) or "nothing",
             }
             for group in groups

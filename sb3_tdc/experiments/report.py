@@ -7,18 +7,18 @@ runs have left; trains and plays nothing.
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_tdc.advb.algorithms import Advised
 from sb3_tdc.algorithms import ALGORITHMS
-from sb3_tdc.experiments import figures, provenance
-from sb3_tdc.experiments.curves import published_steps
-from sb3_tdc.experiments.results import Group, Run, group_runs
+from sb3_tdc.common.words import count, listed
+from sb3_tdc.experiments import provenance
+from sb3_tdc.experiments.groups import Group, group_runs
+from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.sections import Report
 
 
 def warnings(groups: Sequence[Group]) -> list[str]:
     """What a reader must know before looking at a figure."""
-    shares = sorted(
-        {g.n_timesteps / published_steps(g.algo, g.env_id) for g in groups if g.finished and g.algo in ALGORITHMS}
-    )
+    shares = sorted({g.n_timesteps / g.shipped_steps for g in groups if g.finished and g.shipped_steps})
     fewest = min((len(g.finished) for g in groups if g.finished), default=0)
     said = []
     if not shares:
@@ -35,21 +35,45 @@ def warnings(groups: Sequence[Group]) -> list[str]:
         )
     if 0 < fewest < 5:
         said.append(
-            f"As few as {figures.count_seeds(fewest)} a group: differences between algorithms smaller than the spread "
+            f"As few as {count(fewest, 'seed')} a group: differences between algorithms smaller than the spread "
             "across seeds mean nothing."
         )
+    if mixed := [f"{g.label} on {g.conditions}" for g in groups if len(g.commits) > 1]:
+        said.append(
+            f"Seeds of {count(len(mixed), 'group')} were trained by several commits of sb3_tdc ({listed(mixed)}): "
+            "see the commits below, and what changed between them."
+        )
+    advised = [g for g in groups if g.finished and issubclass(ALGORITHMS.get(g.algo, object), Advised)]
+    said += [f"{g.label} on {g.conditions}: {_describe_board(g)}" for g in advised]
     return said
+
+
+def _describe_board(group: Group) -> str:
+    steps = [int(logged[-1]) for run in group.finished if len(logged := run.progress("board/test_steps"))]
+    more = f"{max(steps):,}" if steps else "a number, not published, of"
+    return (
+        f"its board acts in evaluations, and {more} environment steps of test episodes a run are not among its steps."
+    )
+
+
+def _remove_old(folder: Path) -> None:
+    """Remove figures and tables of an earlier report: some may be of runs that are no longer there."""
+    if (folder / "report.html").is_file():
+        for pattern in ("figures/*.svg", "figures/*.png", "figures/*.pdf", "tables/*.csv"):
+            for path in folder.glob(pattern):
+                path.unlink()
 
 
 def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -> Path:
     """
     Write the page, its figures and its tables.
 
-    :param folder: made if it does not exist
+    :param folder: made if it does not exist; figures and tables of an earlier report there are removed
     :return: the page
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    _remove_old(folder)
     groups = group_runs(runs)
     report = Report(groups, folder)
     sections = [

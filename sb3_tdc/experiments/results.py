@@ -1,22 +1,24 @@
-"""Folders of runs (RL Zoo's layout) → arrays. Reads only; loads no model, and unpickles nothing."""
+"""Folders of runs (RL Zoo's layout) → settings and arrays. Reads only; loads no model, and unpickles nothing."""
 
 import inspect
 import json
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.arrays import read_arrays
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.envs.registry import simulator_of
+from sb3_tdc.envs.simulator import GYMNASIUM
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
 
@@ -67,7 +69,9 @@ class Run:
                 args["algo"],
                 args["env"],
                 args["seed"],
-                _flatten({**config, "n_timesteps": folder.n_timesteps, **changed, **_simulator(folder.versions)}),
+                flatten(
+                    {**config, "n_timesteps": folder.n_timesteps, **changed, **_physics(args["env"], folder.versions)}
+                ),
             )
             run.n_timesteps  # noqa: B018  # must be there
         except (OSError, KeyError, TypeError, AttributeError) as error:
@@ -171,61 +175,26 @@ class Run:
         return path.read_text().strip() if path.is_file() else ""
 
 
-@dataclass(frozen=True)
-class Group:
+def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
     """
-    Runs that differ in their seed alone.
+    Find every run below some folders.
 
-    :param label: the algorithm, and in what it differs from the other groups of its algorithm and environment
-    :param runs: at least one, in the order of their seeds
-    """
-
-    label: str
-    runs: tuple[Run, ...]
-
-    @property
-    def algo(self) -> str:
-        return self.runs[0].algo
-
-    @property
-    def env_id(self) -> str:
-        return self.runs[0].env_id
-
-    @property
-    def n_timesteps(self) -> int:
-        return self.runs[0].n_timesteps
-
-    @property
-    def finished(self) -> tuple[Run, ...]:
-        """Those that took all their steps and were evaluated: the only ones that are averaged."""
-        return tuple(run for run in self.runs if run.is_complete and run.evaluations)
-
-    @property
-    def seeds(self) -> str:
-        """How many, and which."""
-        numbers = ", ".join(str(run.seed) for run in self.finished)
-        return f"{len(self.finished)} ({numbers})" if numbers else "0"
-
-    def setting(self, key: str) -> Any:
-        return self.runs[0].setting(key)
-
-
-def find_runs(folder: Path) -> tuple[list[Run], list[str]]:
-    """
-    Find every run below a folder.
-
-    :return: every run below a folder, in the order of its path, and a sentence for each that cannot be read
-    :raises ValueError: if there is none
+    :return: every run, folder after folder, in the order of its path, and a sentence for each that cannot be read
+    :raises ValueError: if there is none below one of the folders
     """
     runs, unreadable = [], []
-    for path in sorted({config.parent.parent for config in folder.rglob("*/config.yml")}, key=_by_number):
-        try:
-            runs.append(Run.open(path))
-        except ValueError as error:
-            unreadable.append(str(error))
+    for folder in folders:
+        paths = sorted({config.parent.parent for config in folder.rglob("*/config.yml")}, key=_by_number)
+        if not paths:
+            reason = "no <algorithm>/<environment>_<number>/<environment>/config.yml"
+            raise ValueError(f"There are no runs in {folder}: {reason}")
+        for path in paths:
+            try:
+                runs.append(Run.open(path))
+            except ValueError as error:
+                unreadable.append(str(error))
     if not runs:
-        reasons = "; ".join(unreadable) or "no <algorithm>/<environment>_<number>/<environment>/config.yml"
-        raise ValueError(f"There are no runs in {folder}: {reasons}")
+        raise ValueError(f"There are no runs in {', '.join(map(str, folders))}: {'; '.join(unreadable)}")
     return runs, unreadable
 
 
@@ -235,97 +204,20 @@ def _by_number(path: Path) -> tuple[Path, str, int]:
     return path.parent, name, int(number) if number.isdigit() else 0
 
 
-def group_runs(runs: Iterable[Run]) -> list[Group]:
-    """
-    Put together what may be averaged: runs of one algorithm and environment that differ in their seed alone.
-
-    A second run of one seed is a repetition, not another seed: of several, the last finished one stays.
-    """
-    found: dict[str, dict[int, Run]] = {}
-    for run in runs:
-        seeds = found.setdefault(_identity(run), {})
-        if run.seed not in seeds or run.is_finished or not seeds[run.seed].is_finished:
-            seeds[run.seed] = run
-    members = [tuple(seeds[seed] for seed in sorted(seeds)) for seeds in found.values()]
-    groups = [Group(_label(group[0], [other[0] for other in members]), group) for group in members]
-    order = list(ALGORITHMS)
-    return sorted(groups, key=lambda g: (g.env_id, order.index(g.algo) if g.algo in order else 99, g.label))
-
-
-def vary(groups: Sequence[Group], key: str) -> list[list[Group]]:
-    """
-    The ablations of one hyperparameter.
-
-    :return: lists of at least two groups that differ in ``key`` alone, ordered by it
-    """
-    found: dict[str, list[Group]] = {}
-    for group in groups:
-        found.setdefault(_identity(group.runs[0], without=key), []).append(group)
-    return [sorted(some, key=lambda g: _sortable(g.setting(key))) for some in found.values() if len(some) > 1]
-
-
-def is_same_but(what: str, one: Group, other: Group) -> bool:
-    """Return whether two groups differ at most in one setting, or, for "algo", in the algorithm alone."""
-    if what == "algo":
-        return _identity(one.runs[0], algo=other.algo) == _identity(other.runs[0])
-    return _identity(one.runs[0], without=what) == _identity(other.runs[0], without=what)
-
-
-def differences(run: Run) -> dict[str, Any]:
-    """Return the settings that are not those of this package's ``hyperparams/``, as they are in the run."""
-    try:
-        entry, _ = read_entry(hyperparams_file(run.algo), run.env_id)
-    except ValueError:
-        entry = {}
-    shipped = Run(run.folder, run.algo, run.env_id, run.seed, _flatten(entry))
-    return {
-        key: run.setting(key)
-        for key in {**shipped.settings, **run.settings}
-        if _canonical(run.setting(key)) != _canonical(shipped.setting(key))
-    }
-
-
-def describe(settings: dict[str, Any]) -> str:
-    """``{"lam": 0.5, "tau": 0.01}`` → "λ 0.5, tau 0.01"."""
-    return ", ".join(_describe(key, value) for key, value in settings.items())
-
-
-def _describe(key: str, value: Any) -> str:
-    if key == "stochastic_actor":
-        return "stochastic head" if value else "deterministic head"
-    name = {"lam": "λ", "n_timesteps": "steps", "mujoco": "MuJoCo"}.get(key, key.removeprefix("policy_kwargs."))
-    if isinstance(value, int) and not isinstance(value, bool):
-        return f"{name} {value:,}"
-    if value is None:
-        return f"{name} left to its default"
-    return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
-
-
-def _label(run: Run, representatives: Sequence[Run]) -> str:
-    """The algorithm's name, and the settings that tell it from its likes and are not those of ``hyperparams/``."""
-    alike = [other for other in representatives if (other.algo, other.env_id) == (run.algo, run.env_id)]
-    keys = {key for other in alike for key in other.settings}
-    telling = {key for key in keys if len({_canonical(other.setting(key)) for other in alike}) > 1}
-    shown = {key: value for key, value in differences(run).items() if key in telling}
-    return f"{run.algo.upper()}, {describe(shown)}" if shown else run.algo.upper()
-
-
-def _simulator(versions: Mapping[str, str]) -> dict[str, str]:
-    """Return which MuJoCo a run was made with: its contacts are others since 3.5 (docs/differences.md)."""
+def _physics(env_id: str, versions: Mapping[str, str]) -> dict[str, str]:
+    """Return which MuJoCo moved a task of MuJoCo: its contacts are others since 3.5 (docs/differences.md)."""
     version = re.match(r"(\d+)\.(\d+)", str(versions.get("mujoco", "")))
-    return {"mujoco": "since 3.5" if tuple(map(int, version.groups())) >= (3, 5) else "before 3.5"} if version else {}
+    if version is None or not _may_use_mujoco(env_id):
+        return {}
+    return {"mujoco": "since 3.5" if tuple(map(int, version.groups())) >= (3, 5) else "before 3.5"}
 
 
-def _identity(run: Run, without: str | None = None, algo: str | None = None) -> str:
-    """
-    Everything but the seed; a default is the same whether it is given or not.
-
-    :param without: a setting to leave out
-    :param algo: as if it were of this algorithm
-    """
-    algo = algo or run.algo
-    settings = {**default_settings(algo), **run.settings}
-    return _canonical([algo, run.env_id, {key: value for key, value in settings.items() if key != without}])
+def _may_use_mujoco(env_id: str) -> bool:
+    """Return False for PyBullet's, Isaac Lab's and Gymnasium's other tasks: which MuJoCo is installed is no matter."""
+    if simulator_of(env_id) is not GYMNASIUM:
+        return False
+    entry_point = str(gym.registry[env_id].entry_point) if env_id in gym.registry else ""
+    return not entry_point.startswith("gymnasium.envs.") or entry_point.startswith("gymnasium.envs.mujoco.")
 
 
 @cache
@@ -335,7 +227,7 @@ def default_settings(algo: str) -> dict[str, Any]:
     return {**{p.name: p.default for p in parameters if p.default is not p.empty}, **_SETTINGS}
 
 
-def _canonical(value: Any) -> str:
+def canonical(value: Any) -> str:
     """A text that is the same for the same settings: 1 and 1.0 are."""
 
     def same(item: Any) -> Any:
@@ -350,18 +242,15 @@ def _canonical(value: Any) -> str:
 
 def same_settings(one: Any, other: Any) -> bool:
     """Return whether two settings say the same: 1 and 1.0 do."""
-    return _canonical(one) == _canonical(other)
+    return canonical(one) == canonical(other)
 
 
-def _sortable(value: Any) -> tuple[bool, Any]:
-    return (False, value) if isinstance(value, (bool, int, float)) else (True, str(value))
-
-
-def _flatten(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"policy_kwargs": {"n_quantiles": 64}}`` → ``{"policy_kwargs.n_quantiles": 64}``."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, dict) and value:
-            flat.update(_flatten(value, f"{prefix}{key}."))
+            flat.update(flatten(value, f"{prefix}{key}."))
         else:
             flat[f"{prefix}{key}"] = value
     return flat

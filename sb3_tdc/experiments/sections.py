@@ -3,7 +3,7 @@
 import base64
 import io
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdc.experiments import figures, provenance, statistics, tables
+from sb3_tdc.common.words import count, listed
+from sb3_tdc.experiments import figures, provenance, tables
+from sb3_tdc.experiments.ablations import ABLATIONS
+from sb3_tdc.experiments.aggregate import Aggregate, aggregate
 from sb3_tdc.experiments.claims import MIN_SEEDS_OF_SPREAD
 from sb3_tdc.experiments.curves import bin_width, headline, make_curve, read_evaluations, read_td_errors
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
+from sb3_tdc.experiments.groups import Conditions, Group, by_conditions, shared_differences, vary
 from sb3_tdc.experiments.published_curves import published_curves
-from sb3_tdc.experiments.results import Group, Run, vary
+from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import ISAAC, MUJOCO, PYBULLET
+from sb3_tdc.experiments.variants import compare_variants
 
 
 @dataclass(frozen=True)
@@ -49,9 +54,7 @@ class Report:
     def __init__(self, groups: Sequence[Group], folder: Path):
         self.groups, self.folder = groups, folder
         self.returns = tables.make_returns_table(groups)
-        others = [g.label for g in groups if g.label not in figures.COLORS]
-        cycle = figures.OTHER_COLORS
-        self.colors = figures.COLORS | {label: cycle[i % len(cycle)] for i, label in enumerate(dict.fromkeys(others))}
+        self.conditions = by_conditions(groups, (*MUJOCO, *PYBULLET, *ISAAC))
 
     def draw(self, name: str, caption: str, function: Callable[..., None], *args: Any, **kwargs: Any) -> Picture:
         """Draw one figure by a function of axes and arrays, and write it as SVG, PNG and PDF."""
@@ -82,31 +85,25 @@ class Report:
             self.write_table(name, table)
             section.tables.append((caption, table))
 
-    def by_env(self, groups: Iterable[Group]) -> dict[str, list[Group]]:
-        """The paper's order of tasks, then the alphabet's."""
-        found: dict[str, list[Group]] = {}
-        for group in groups:
-            found.setdefault(group.env_id, []).append(group)
-        known = [*MUJOCO, *PYBULLET, *ISAAC]
-        return dict(sorted(found.items(), key=lambda item: known.index(item[0]) if item[0] in known else len(known)))
-
     def draw_learning_curves(
         self, name: str, groups: Sequence[Group], labels: Sequence[str], colors: Sequence[Any]
     ) -> Picture:
+        """Draw the evaluations of groups under the same conditions."""
+        conditions = groups[0].conditions
         width = max(map(bin_width, groups))
         curves = [
             make_curve(group, label, color, width, read_evaluations)
             for group, label, color in zip(groups, labels, colors, strict=True)
         ]
-        episodes = sorted({str(run.evaluations.returns.shape[1]) for g in groups for run in g.runs if run.evaluations})
+        episodes = sorted({run.evaluations.returns.shape[1] for g in groups for run in g.runs if run.evaluations})
         return self.draw(
-            f"{name}-{groups[0].env_id}",
-            f"{_steps(groups)}; bins of {width:,} steps. {_seeds(groups, labels)}",
+            f"{name}-{conditions.file_name}",
+            f"{_about(conditions)}; bins of {width:,} steps. {_seeds(groups, labels)} {shared_differences(groups)}",
             figures.draw_curves,
             curves,
-            groups[0].env_id,
-            f"return of {_and(episodes) or 'no'} mean-action episodes",
-            published=[curve for curve in published_curves(groups[0].env_id) if curve.algorithm == "SAC"],
+            conditions.task,
+            f"return of {listed(list(map(str, episodes))) or 'no'} mean-action episodes",
+            published=[curve for curve in published_curves(conditions.env_id) if curve.algorithm == "SAC"],
         )
 
     def learning_curves(self) -> Section:
@@ -116,14 +113,15 @@ class Report:
             "but never below the distance of evaluations. Thick: mean over seeds; band: 95 % interval of that mean "
             "(Student's t over seeds); thin: single seeds. One seed has no band. Unfinished runs are dotted and not "
             "averaged. The band of two seeds is huge, and runs off the axis, which is made for the seeds. Dashed: SAC "
-            "as the repository of SimbaV2 has published it, with the interval of its seeds.",
+            "as the repository of SimbaV2 has published it, with the interval of its seeds. Algorithms are shown as "
+            "hyperparams/ has them, where they have been run so. One figure for each number of steps.",
         )
-        for groups in self.by_env(self.groups).values():
-            shown = headline(groups)
-            labels = [group.label for group in shown]
-            section.pictures.append(
-                self.draw_learning_curves("learning-curve", shown, labels, [self.colors[label] for label in labels])
-            )
+        for groups in self.conditions.values():
+            if shown := headline(groups):
+                labels = [group.label for group in shown]
+                section.pictures.append(
+                    self.draw_learning_curves("learning-curve", shown, labels, figures.colors_of(labels))
+                )
         return section
 
     def returns_section(self) -> Section:
@@ -139,87 +137,54 @@ class Report:
         )
         if len(self.returns):
             section.tables.append(("", tables.show_returns(self.returns)))
-        scores = self.scores()
-        if scores:
-            labels = list(scores)
-            intervals = [
-                (float(statistics.interquartile_mean(*tasks)), *statistics.iqm_interval(tasks))
-                for tasks in scores.values()
-            ]
-            env_ids = self.common_envs(labels)
-            envs = _and(env_ids)
-            steps = _steps([g for g in self.groups if g.label in labels and g.env_id in env_ids])
-            table = pd.DataFrame(intervals, columns=["iqm", "low", "high"]).assign(algorithm=labels, tasks=envs)
-            self.write_table("aggregate", table)
-            section.pictures.append(
-                self.draw(
-                    "aggregate",
-                    f"Final returns over {envs}: interquartile mean of scores with 95 % stratified bootstrap interval. "
-                    "0 and 1 are the lowest and highest single run on a task in this report.",
-                    figures.draw_intervals,
-                    [f"{label}\n{sum(map(len, scores[label]))} runs" for label in labels],
-                    [self.colors[label] for label in labels],
-                    intervals,
-                    f"{envs}, {steps}",
-                    "IQM of normalised final returns",
-                )
-            )
+        for one in aggregate(self.groups):
+            self.add_aggregate(section, one)
         return section
 
-    def common_envs(self, labels: Sequence[str]) -> list[str]:
-        """Environments on which all of these have at least two finished seeds."""
-        several = {(g.env_id, g.label) for g in self.groups if len(g.finished) > 1}
-        return [env for env in self.by_env(self.groups) if all((env, label) in several for label in labels)]
-
-    def scores(self) -> dict[str, list[np.ndarray]]:
-        """Return the scores by task of every algorithm that has two seeds on each of at least two tasks."""
-        several = [g.label for g in self.groups if len(g.finished) > 1 and g.label == g.algo.upper()]
-        labels = [label for label in dict.fromkeys(several) if several.count(label) == max(map(several.count, several))]
-        envs = self.common_envs(labels)
-        if len(envs) < 2 or len(labels) < 2:
-            return {}
-        scores: dict[str, list[np.ndarray]] = {label: [] for label in labels}
-        for env in envs:
-            final = {
-                g.label: tables.final_returns(g.finished) for g in self.groups if g.env_id == env and g.label in labels
-            }
-            for label, values in statistics.normalise_scores(final).items():
-                scores[label].append(values)
-        return scores
+    def add_aggregate(self, section: Section, found: Aggregate) -> None:
+        """Draw the scores over tasks, and write them as CSV."""
+        labels, intervals, tasks = list(found.scores), found.intervals(), listed(found.env_ids)
+        name = f"aggregate-{found.length.split()[0].replace(',', '')}"
+        table = pd.DataFrame(intervals, columns=["iqm", "low", "high"])
+        self.write_table(name, table.assign(algorithm=labels, tasks=tasks, length=found.length))
+        left_out = f" Not on all of these tasks with two seeds: {listed(found.left_out)}." if found.left_out else ""
+        section.pictures.append(
+            self.draw(
+                name,
+                f"Final returns over {tasks}, {found.length}: interquartile mean of scores with 95 % stratified "
+                "bootstrap interval. 0 and 1 are the lowest and highest single run on a task, of those that are "
+                f"compared here.{left_out}",
+                figures.draw_intervals,
+                [f"{label}\n{count(sum(map(len, found.scores[label])), 'run')}" for label in labels],
+                figures.colors_of(labels),
+                intervals,
+                f"{count(len(found.env_ids), 'task')}, {found.length}",
+                "IQM of normalised final returns",
+            )
+        )
 
     def lambda_sweep(self) -> Section:
         section = Section(
             "λ (Fig. 3)",
             "Groups that differ in λ alone. Left of each pair: learning curves; right: final return against λ, every "
             "seed a dot, mean and 95 % t interval where there are several; a λ that calibrates itself has no place on "
-            "that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and HalfCheetah.",
+            "that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and HalfCheetah. Then variants of TDC "
+            "next to the runs that they are compared with.",
         )
         import matplotlib
 
-        for number, groups in enumerate(self.ablations("lam")):
+        for number, groups in enumerate(self.ablations("lam"), 1):
             values = [group.setting("lam") for group in groups]
             colors = list(matplotlib.colormaps["viridis"](np.linspace(0, 0.85, len(groups))))
-            suffix = f"-{number + 1}"
             labels = [f"λ = {value}" if isinstance(value, str) else f"λ = {value:g}" for value in values]
-            section.pictures.append(self.draw_learning_curves(f"lambda-curves{suffix}", groups, labels, colors))
-            done = [
-                (value, tables.final_returns(group.finished))
-                for value, group in zip(values, groups, strict=True)
-                if group.finished and not isinstance(value, str)
-            ]
-            if len(done) > 1:
-                section.pictures.append(
-                    self.draw(
-                        f"lambda-sweep{suffix}-{groups[0].env_id}",
-                        f"{_steps(groups)}. {_seeds(groups, labels)}",
-                        figures.draw_sweep,
-                        [value for value, _ in done],
-                        [returns for _, returns in done],
-                        f"{groups[0].env_id}, {_steps(groups)}",
-                        "λ",
-                        self.colors["TDC"],
-                    )
-                )
+            section.pictures.append(self.draw_learning_curves(f"lambda-curves-{number}", groups, labels, colors))
+            numbers = [group for group in groups if group.finished and not isinstance(group.setting("lam"), str)]
+            if len(numbers) > 1:
+                section.pictures.append(self.draw_sweep(f"lambda-sweep-{number}", numbers))
+        for groups in self.conditions.values():
+            if shown := _variants_and_controls(groups):
+                labels = [group.label for group in shown]
+                section.pictures.append(self.draw_learning_curves("variants", shown, labels, figures.colors_of(labels)))
         self.add_table(
             section,
             "lambda",
@@ -237,20 +202,35 @@ class Report:
         )
         return section
 
+    def draw_sweep(self, name: str, groups: Sequence[Group]) -> Picture:
+        """Draw final returns against λ, of groups that differ in a fixed λ alone."""
+        conditions, values = groups[0].conditions, [group.setting("lam") for group in groups]
+        return self.draw(
+            f"{name}-{conditions.file_name}",
+            f"{_about(conditions)}. {_seeds(groups, [f'λ = {value:g}' for value in values])} "
+            f"{shared_differences(groups)}",
+            figures.draw_sweep,
+            values,
+            [group.final_returns for group in groups],
+            str(conditions),
+            "λ",
+            figures.COLORS["TDC"],
+        )
+
     def heads(self) -> Section:
         section = Section(
             "Deterministic and stochastic head (Fig. 2)",
             "Groups of TDC that differ in the head alone. Both are evaluated by the mean action.",
         )
-        for number, groups in enumerate(self.ablations("stochastic_actor")):
+        for number, groups in enumerate(self.ablations("stochastic_actor"), 1):
             labels = ["stochastic" if group.setting("stochastic_actor") else "deterministic" for group in groups]
-            colors = [self.colors["TDC"], figures.OTHER_COLORS[0]]
-            section.pictures.append(self.draw_learning_curves(f"heads-{number + 1}", groups, labels, colors))
+            colors = [figures.COLORS["TDC"], figures.OTHER_COLORS[0]]
+            section.pictures.append(self.draw_learning_curves(f"heads-{number}", groups, labels, colors))
         return section
 
     def ablations(self, key: str) -> list[list[Group]]:
         """Groups of TDC that differ in one setting alone."""
-        return vary([g for groups in self.by_env(self.groups).values() for g in groups if g.algo == "tdc"], key)
+        return vary([g for groups in self.conditions.values() for g in groups if g.algo == "tdc"], key)
 
     def td_errors(self) -> Section:
         section = Section(
@@ -260,20 +240,24 @@ class Report:
             "λ = 1 on Hopper. Returns that grow make TD errors grow too: a smaller variance is not by itself a "
             "better run.",
         )
-        for env_id, groups in self.by_env(g for g in self.groups if g.algo == "tdc").items():
-            width = max(map(bin_width, groups))
+        for conditions, groups in self.conditions.items():
+            shown = [group for group in groups if group.algo == "tdc"]
+            labels = [group.label for group in shown]
+            width = max(map(bin_width, shown), default=1)
             curves = [
-                make_curve(group, group.label, self.colors[group.label], width, read_td_errors) for group in groups
+                make_curve(group, label, color, width, read_td_errors)
+                for group, label, color in zip(shown, labels, figures.colors_of(labels), strict=True)
             ]
             if not any(np.isfinite(curve.values).any() for curve in curves):
                 continue
             section.pictures.append(
                 self.draw(
-                    f"td-error-variance-{env_id}",
-                    f"{_steps(groups)}; bins of {width:,} steps. {_seeds(groups, [g.label for g in groups])}",
+                    f"td-error-variance-{conditions.file_name}",
+                    f"{_about(conditions)}; bins of {width:,} steps. {_seeds(shown, labels)} "
+                    f"{shared_differences(shown)}",
                     figures.draw_curves,
                     curves,
-                    env_id,
+                    conditions.task,
                     "variance of TD errors",
                     log=True,
                 )
@@ -287,27 +271,30 @@ class Report:
             "of all seeds, the dots are the means of the seeds: a tight box with dots far apart is a policy that "
             "repeats itself, and a training that does not.",
         )
-        for env_id, groups in self.by_env(self.groups).items():
-            tested = []
-            for group in headline(groups):
-                returns = [r for run in group.finished if (r := read_test_returns(run)) is not None]
-                if returns:
-                    fewest = min(map(len, returns))
-                    tested.append((group, np.array([r[:fewest] for r in returns])))
-            if tested:
-                some = [group for group, _ in tested]
-                labels = [group.label for group in some]
-                section.pictures.append(
-                    self.draw(
-                        f"test-returns-{env_id}",
-                        f"After {_steps(some)}. " + _seeds(some, labels, [len(r) for _, r in tested]),
-                        figures.draw_box_plots,
-                        labels,
-                        [self.colors[label] for label in labels],
-                        [returns for _, returns in tested],
-                        f"{env_id}, {_steps(some)}",
-                    )
+        for conditions, groups in self.conditions.items():
+            shown = [(g, read_all_test_returns(g)) for g in headline(groups) if g.finished]
+            played = [(group, returns) for group, returns in shown if len(returns)]
+            if not played:
+                continue
+            labels = [group.label for group, _ in played]
+            missing = [
+                f"{group.label} ({len(group.finished) - len(returns)} of {count(len(group.finished), 'seed')})"
+                for group, returns in shown
+                if len(returns) < len(group.finished)
+            ]
+            section.pictures.append(
+                self.draw(
+                    f"test-returns-{conditions.file_name}",
+                    f"After {_about(conditions)}. {_seeds([], labels, [len(returns) for _, returns in played])} "
+                    + (f"Without test episodes: {listed(missing)}. " if missing else "")
+                    + shared_differences([group for group, _ in played]),
+                    figures.draw_box_plots,
+                    labels,
+                    figures.colors_of(labels),
+                    [returns for _, returns in played],
+                    str(conditions),
                 )
+            )
         return section
 
     def published(self) -> Section:
@@ -331,10 +318,11 @@ class Report:
     def claims(self) -> Section:
         section = Section(
             "The paper's claims",
-            "What the paper says, against the runs that are here, on every task and number of steps. A verdict needs "
-            "95 % intervals over seeds that do not overlap (Student's t for means, χ² for standard deviations); heads "
-            "are interchangeable if their intervals lie within a tenth of each other. Everything else is undecided: "
-            f"one seed decides nothing, and fewer than {MIN_SEEDS_OF_SPREAD} decide nothing about a spread.",
+            "What the paper says, against the runs that are here, on the tasks that it says it of, for every number "
+            "of steps. A verdict needs 95 % intervals over seeds that do not overlap (Student's t for means, χ² for "
+            "standard deviations over seeds). Returns are comparable, and heads interchangeable, if the intervals lie "
+            "within a tenth of each other. Everything else is undecided: one seed decides nothing, and fewer than "
+            f"{MIN_SEEDS_OF_SPREAD} decide nothing about a standard deviation over seeds.",
         )
         self.add_table(section, "claims", tables.make_claims_table(self.groups))
         return section
@@ -342,8 +330,9 @@ class Report:
     def missing(self, runs: Sequence[Run], unreadable: Sequence[str]) -> Section:
         section = Section(
             "What is here, and what is missing",
-            "Seeds with finished runs, for each of the paper's experiments; λ and the head decide to which a run "
-            "belongs, whatever its steps. The paper does not say how many seeds it used.",
+            "Seeds with finished runs, and after how many steps, for each of the paper's experiments. A run belongs "
+            "to one if its hyperparameters are those of hyperparams/, but for what the experiment varies. The paper "
+            "does not say how many seeds it used.",
             tables=provenance.compare_with_paper(runs),
         )
         unfinished = provenance.list_unfinished(runs, unreadable)
@@ -352,15 +341,31 @@ class Report:
         return section
 
 
-def _steps(groups: Sequence[Group]) -> str:
-    return _and([f"{steps:,}" for steps in sorted({group.n_timesteps for group in groups})]) + " steps"
+def read_all_test_returns(group: Group) -> np.ndarray:
+    """
+    Read the test returns of a group.
+
+    :return: (finished runs that have played them, episodes that all of these have played)
+    """
+    played = [returns for run in group.finished if (returns := read_test_returns(run)) is not None]
+    fewest = min(map(len, played), default=0)
+    return np.array([returns[:fewest] for returns in played]).reshape(len(played), fewest)
+
+
+def _variants_and_controls(groups: Sequence[Group]) -> list[Group]:
+    """Of groups under the same conditions: ablations, and TDC as it is compared with them."""
+    compared = [c for c in compare_variants(groups) if c.variant.algo in ABLATIONS]
+    shown = [group for comparison in compared for group in (comparison.variant, comparison.control)]
+    return [group for group in groups if group in shown]
+
+
+def _about(conditions: Conditions) -> str:
+    """The number of steps, and the physics where they matter."""
+    physics = f" with MuJoCo {conditions.mujoco}" if conditions.mujoco else ""
+    return f"{conditions.n_timesteps:,} steps{physics}"
 
 
 def _seeds(groups: Sequence[Group], labels: Sequence[str], numbers: Sequence[int] | None = None) -> str:
     """Seeds of each line of a figure: ``"Seeds: TDC 3 (1, 2, 3); SAC 1 (1)."``."""
     counted = [group.seeds for group in groups] if numbers is None else list(map(str, numbers))
     return "Seeds: " + "; ".join(f"{label}: {seeds}" for label, seeds in zip(labels, counted, strict=True)) + "."
-
-
-def _and(words: Sequence[str]) -> str:
-    return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else "".join(words)

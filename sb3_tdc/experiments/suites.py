@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from sb3_tdc.experiments.groups import is_as_shipped
 from sb3_tdc.experiments.results import Run
 
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
@@ -26,9 +27,11 @@ class Cell:
     n_timesteps: int | None = None
 
     def includes(self, run: Run) -> bool:
-        """Return whether a run is of this cell; λ and the head decide, since scale and budget may differ."""
-        return (run.algo, run.env_id) == (self.algo, self.env_id) and all(
-            run.setting(key) == value for key, value in self.settings.items()
+        """Return whether a run is of this cell: with its settings, and otherwise as ``hyperparams/`` has it."""
+        return (
+            (run.algo, run.env_id) == (self.algo, self.env_id)
+            and all(run.setting(key) == value for key, value in self.settings.items())
+            and is_as_shipped(run, but=self.settings)
         )
 
 

@@ -9,20 +9,19 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.words import count
 from sb3_tdc.experiments import statistics
+from sb3_tdc.experiments.aggregate import length_of
 from sb3_tdc.experiments.claims import Interval, examine
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
+from sb3_tdc.experiments.groups import Conditions, Group, by_conditions
 from sb3_tdc.experiments.published_curves import published_curves
-from sb3_tdc.experiments.results import Group, Run
+from sb3_tdc.experiments.results import Run
+from sb3_tdc.experiments.suites import MUJOCO
 from sb3_tdc.experiments.variants import compare_variants
 
 TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
 _PUBLISHED = Path(__file__).with_name("published.yml")
-
-
-def final_returns(runs: Sequence[Run]) -> np.ndarray:
-    """Return the mean of the last evaluation of every run, (runs,)."""
-    return np.array([statistics.final_return(run.evaluations.returns) for run in runs if run.evaluations])
 
 
 def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
@@ -32,7 +31,7 @@ def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
         curves = [run.evaluations for run in group.finished if run.evaluations]
         if not curves:
             continue
-        final = final_returns(group.finished)
+        final = group.final_returns
         best = np.array([statistics.best_return(curve.returns) for curve in curves])
         area = np.array([statistics.area_under_curve(curve.timesteps, curve.returns) for curve in curves])
         low, high = statistics.iqm_interval([final])
@@ -42,7 +41,9 @@ def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
             {
                 "environment": group.env_id,
                 "algorithm": group.label,
+                "mujoco": group.conditions.mujoco,
                 "steps": group.n_timesteps,
+                "length": length_of(group),
                 "seeds": len(curves),
                 "episodes": curves[0].returns.shape[1],
                 "final_mean": final.mean(),
@@ -76,10 +77,10 @@ def show_returns(table: pd.DataFrame) -> pd.DataFrame:
         )
         test = plus_minus(row["test_mean"], row["test_std"])
         if row["test_seeds"] < row["seeds"] or row["test_episodes"] < EPISODES:
-            test += f" ({row['test_seeds']} of {row['seeds']} seeds, {row['test_episodes']} episodes)"
+            test += f" ({row['test_seeds']} of {count(row['seeds'], 'seed')}, {count(row['test_episodes'], 'episode')})"
         rows.append(
             {
-                "Environment": row["environment"],
+                "Environment": Conditions(row["environment"], row["steps"], row["mujoco"]).task,
                 "Algorithm": row["algorithm"],
                 "Steps": number(row["steps"]),
                 "Seeds": row["seeds"],
@@ -102,7 +103,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     ours = [row for row in table.to_dict("records") if row["environment"].rpartition("-")[0] in TASKS]
-    for (algorithm, version), some in _grouped(ours).items():
+    for (algorithm, version, *_), some in _grouped(ours).items():
         by_task = {row["environment"].rpartition("-")[0]: row for row in some}
         rows.append(
             {
@@ -142,18 +143,16 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
 def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
     """Ours after their last step, then each published algorithm after as many, by task and number of steps."""
     rows = []
-    for env_id, steps in sorted({(g.env_id, g.n_timesteps) for g in groups if g.finished}):
-        published = [(curve, *curve.at(steps)) for curve in published_curves(env_id)]
+    for conditions, alike in by_conditions((g for g in groups if g.finished), MUJOCO).items():
+        published = [(curve, *curve.at(conditions.n_timesteps)) for curve in published_curves(conditions.env_id)]
         if not any(np.isfinite(mean) for _, mean, *_ in published):
             continue
-        for group in groups:
-            if (group.env_id, group.n_timesteps) == (env_id, steps) and group.finished:
-                final = final_returns(group.finished)
-                returns = _with_interval(*map(float, statistics.mean_interval(final)))
-                rows.append((env_id, f"{steps:,}", f"{group.label}: this report", returns, str(len(final))))
+        where = conditions.task, f"{conditions.n_timesteps:,}"
+        for group in alike:
+            returns = _with_interval(*map(float, statistics.mean_interval(group.final_returns)))
+            rows.append((*where, f"{group.label}: this report", returns, str(len(group.finished))))
         for curve, *interval in published:
-            name = f"{curve.algorithm}: published"
-            rows.append((env_id, f"{steps:,}", name, _with_interval(*interval), str(curve.seeds)))
+            rows.append((*where, f"{curve.algorithm}: published", _with_interval(*interval), str(curve.seeds)))
     return pd.DataFrame(rows, columns=["Environment", "Steps", "Algorithm", "Return", "Seeds"])
 
 
@@ -180,7 +179,7 @@ def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
             continue
         rows.append(
             {
-                "Environment": group.env_id,
+                "Environment": group.conditions.task,
                 "Algorithm": group.label,
                 "Steps": number(group.n_timesteps),
                 "Seeds": len(group.finished),
@@ -213,8 +212,8 @@ def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
     rows = [
         {
             "Claim": claim.says,
-            "Environment": claim.env_id,
-            "Steps": f"{claim.n_timesteps:,}",
+            "Environment": claim.group.conditions.task,
+            "Steps": f"{claim.group.n_timesteps:,}",
             "Compared": claim.what,
             "Ours": f"{claim.sides[0]}: {_of_seeds(claim.ours)}",
             "Other": f"{claim.sides[1]}: {_of_seeds(claim.other)}",
@@ -230,7 +229,7 @@ def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
     return pd.DataFrame(
         [
             {
-                "Environment": comparison.variant.env_id,
+                "Environment": comparison.variant.conditions.task,
                 "Steps": number(comparison.variant.n_timesteps),
                 "Variant": _of_returns(comparison.variant, comparison.returns[0]),
                 "Control": _of_returns(comparison.control, comparison.returns[1]),
@@ -245,11 +244,11 @@ def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 def _of_returns(group: Group, returns: np.ndarray) -> str:
     mean = plus_minus(returns.mean(), statistics.spread(returns))
-    return f"{group.label}: {mean} ({len(returns)} seed{'s' * (len(returns) != 1)})"
+    return f"{group.label}: {mean} ({count(len(returns), 'seed')})"
 
 
 def _of_seeds(interval: Interval) -> str:
-    return f"{_with_interval(interval.value, interval.low, interval.high)} ({interval.n} seed{'s' * (interval.n != 1)})"
+    return f"{_with_interval(interval.value, interval.low, interval.high)} ({count(interval.n, 'seed')})"
 
 
 def number(value: float) -> str:
@@ -278,8 +277,10 @@ def _per_task(values: dict[str, str]) -> str:
     return " / ".join(values.get(task, "–") for task in TASKS)
 
 
-def _grouped(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+def _grouped(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str, str], list[dict[str, Any]]]:
+    """By algorithm, version of the tasks, length and physics: a row of the table has one number for each task."""
+    groups: dict[tuple[str, str, str, str], list[dict[str, Any]]] = {}
     for row in rows:
-        groups.setdefault((row["algorithm"], row["environment"].rpartition("-")[2]), []).append(row)
+        version = row["environment"].rpartition("-")[2]
+        groups.setdefault((row["algorithm"], version, row["length"], row["mujoco"]), []).append(row)
     return groups

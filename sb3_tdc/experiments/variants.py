@@ -14,7 +14,7 @@ from scipy import stats
 
 from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.ablations import ABLATIONS
-from sb3_tdc.experiments.results import Group, is_same_but
+from sb3_tdc.experiments.groups import Group, by_conditions, is_same_but
 
 _LEVEL = 0.05
 
@@ -45,18 +45,16 @@ class Comparison:
 
 def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
     """
-    Return the comparisons of every task.
+    Return the comparisons of every task and number of steps.
 
     λ is compared with λ = 0, and an algorithm of the ablations with TDC of the same hyperparameters.
     """
-    tasks: dict[tuple[str, int], list[Comparison]] = {}
-    for variant, control in _pairs(groups):
-        tasks.setdefault((variant.env_id, variant.n_timesteps), []).append(_compare(variant, control))
-    return [
-        replace(comparison, p=float(p))
-        for of_task in tasks.values()
-        for comparison, p in zip(of_task, statistics.holm(np.array([c.p for c in of_task])), strict=True)
-    ]
+    found = []
+    for alike in by_conditions(groups).values():
+        compared = [_compare(variant, control) for variant, control in _pairs(alike)]
+        corrected = statistics.holm(np.array([comparison.p for comparison in compared]))
+        found += [replace(comparison, p=float(p)) for comparison, p in zip(compared, corrected, strict=True)]
+    return found
 
 
 def _pairs(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
@@ -71,7 +69,7 @@ def _pairs(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
 
 def _compare(variant: Group, control: Group) -> Comparison:
     """With the p-value of this comparison alone."""
-    ours, others = (late_returns(group) for group in (variant, control))
+    ours, others = variant.late_returns, control.late_returns
     mean = float(ours.mean() - others.mean())
     if min(len(ours), len(others)) < 2:
         return Comparison(variant, control, (ours, others), (mean, np.nan, np.nan), np.nan)
@@ -79,8 +77,3 @@ def _compare(variant: Group, control: Group) -> Comparison:
     interval = test.confidence_interval(1 - _LEVEL)
     difference = mean, float(interval.low), float(interval.high)
     return Comparison(variant, control, (ours, others), difference, float(test.pvalue))
-
-
-def late_returns(group: Group) -> np.ndarray:
-    """(runs,), the mean of the evaluations in the last third of every finished run"""
-    return np.array([run.late_evaluations().mean() for run in group.finished])

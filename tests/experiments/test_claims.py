@@ -6,21 +6,32 @@ from scipy import stats
 
 from sb3_tdc.experiments import claims, statistics, tables
 from sb3_tdc.experiments.claims import Interval, examine
-from sb3_tdc.experiments.results import find_runs, group_runs
+from sb3_tdc.experiments.groups import group_runs
+from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from tests.helpers.run_folders import make_run
 
 
+def examine_folder(folder):
+    return examine(group_runs(find_runs(folder)[0]))
+
+
+def number(n, folder):
+    """The comparisons for one of the claims."""
+    return [claim for claim in examine_folder(folder) if claim.says.startswith(str(n))]
+
+
 def compare(folder):
-    return {(c.says[0], c.what.split()[0], *c.sides): c for c in examine(group_runs(find_runs(folder)[0]))}
+    """Of runs of one length on one task."""
+    return {(c.says[0], c.what.split()[0], *c.sides): c for c in examine_folder(folder)}
 
 
-def make_runs(folder, finals, algo="tdc", **changed):
-    """Runs with the hyperparameters of ``hyperparams/``, but for what is changed."""
-    shipped, _ = read_entry(hyperparams_file(algo), "Hopper-v4")
+def make_runs(folder, finals, algo="tdc", env_id="Hopper-v4", log=None, **changed):
+    """Runs with the hyperparameters of ``hyperparams/``, but for what is changed. Their last evaluation is late."""
+    shipped, _ = read_entry(hyperparams_file(algo), env_id)
     config = {**shipped, "n_timesteps": 1000, "learning_starts": 100, **changed}
     for seed, final in enumerate(finals, 1):
-        make_run(folder, algo, seed=seed, returns=((0.0, 0.0), (final, final)), **config)
+        make_run(folder, algo, env_id, seed=seed, returns=((0.0, 0.0), (final, final)), log=log, **config)
 
 
 def test_intervals_that_do_not_overlap_decide():
@@ -49,6 +60,58 @@ def test_what_is_the_same_lies_within_a_tenth(other, verdict):
     assert claims.judge_same(other, Interval(100, 98, 102, 3)) == verdict
 
 
+@pytest.mark.parametrize(
+    ("ours", "verdict"),
+    [
+        (Interval(130, 120, 140, 3), "held"),  # more
+        (Interval(100, 97, 103, 3), "held"),  # the margin is 10: 97 ≥ 102 − 10
+        (Interval(95, 93, 97, 3), "held"),  # less, but not by a tenth
+        (Interval(100, 80, 120, 3), "undecided"),  # perhaps a fifth less
+        (Interval(80, 75, 85, 3), "not held"),
+        (Interval(500, np.nan, np.nan, 1), "undecided: too few seeds"),
+    ],
+)
+def test_what_is_at_least_as_large_is_at_most_a_tenth_smaller(ours, verdict):
+    assert claims.judge_at_least(ours, Interval(100, 98, 102, 3)) == verdict
+
+
+def test_a_run_that_improves_does_not_scatter(tmp_path):
+    # The last third of twelve evaluations has four. About the line: 0 and ±1, ∓1, ±1, ∓1 less their own line
+    rising = [(0.0,)] * 8 + [(10.0,), (20.0,), (30.0,), (40.0,)]
+    zigzag = [(0.0,)] * 8 + [(1.0,), (-1.0,), (1.0,), (-1.0,)]
+    few = [(0.0,)] * 4 + [(10.0,), (20.0,)]
+    for lam, returns in ((0.1, rising), (0.2, zigzag), (0.3, few)):
+        make_run(tmp_path, lam=lam, returns=returns)
+    found = {g.setting("lam"): claims.late_spread(g).value for g in group_runs(find_runs(tmp_path)[0])}
+    assert found[0.1] == pytest.approx(0)
+    # Slope Σxy/Σx² = (−1.5 + 0.5 + 0.5 − 1.5)/5 = −0.4; residuals 0.4, −1.2, 1.2, −0.4; √(3.2/2)
+    assert found[0.2] == pytest.approx(1.6**0.5)
+    assert np.isnan(found[0.3])  # two points are always on a line
+
+
+def test_heads_are_judged_as_the_paper_says_of_the_task(tmp_path):
+    for env_id in ("HalfCheetah-v4", "Ant-v4", "Walker2d-v4", "Humanoid-v4", "Reacher-v4"):
+        make_runs(tmp_path, (99, 100, 101), env_id=env_id)
+        make_runs(tmp_path, (199, 200, 201), env_id=env_id, stochastic_actor=True)
+    found = {claim.group.env_id: claim for claim in number(4, tmp_path)}
+    assert {env_id: claim.verdict for env_id, claim in found.items()} == {
+        "HalfCheetah-v4": "not held",  # the same
+        "Humanoid-v4": "not held",
+        "Ant-v4": "not held",  # deterministic
+        "Walker2d-v4": "held",  # stochastic
+    }
+    make_runs(tmp_path / "alike", (99, 100, 101))
+    make_runs(tmp_path / "alike", (100, 101, 102), stochastic_actor=True)
+    (found,) = number(4, tmp_path / "alike")
+    assert (found.says, found.verdict) == ("4. The heads are interchangeable", "held")
+
+
+def test_ablations_of_other_hyperparameters_say_nothing_of_the_paper(tmp_path):
+    for lam in (0.0, 1.0):
+        make_runs(tmp_path, (1, 2, 3), env_id="HalfCheetah-v4", lam=lam, kappa=5.0)
+    assert compare(tmp_path) == {}
+
+
 def test_the_interval_of_a_spread():
     # (n − 1)s²/χ²: of 1, 2, 3 with s = 1: √(2/7.3778) and √(2/0.050636)
     assert statistics.spread_interval(np.array([1.0, 2.0, 3.0])) == pytest.approx((0.5207, 6.2847), rel=1e-3)
@@ -64,13 +127,13 @@ def test_final_returns_and_spreads(tmp_path):
     make_runs(tmp_path, (10,), algo="meow")
     found = compare(tmp_path)
     half = stats.t.ppf(0.975, 2) / 3**0.5
-    against = found["1", "final", "TDC", "TD3"]
+    against = found["1", "mean", "TDC", "TD3"]
     assert (against.ours.low, against.other.high) == pytest.approx((101 - half, 51 + half))
     assert against.verdict == "held"
-    assert found["1", "final", "TDC", "SAC"].verdict == "undecided"
-    assert found["1", "final", "TDC", "MEOW"].verdict == "undecided: too few seeds"
-    assert found["2", "standard", "TDC", "SAC"].verdict != "held"  # the last quantity of that name: late in training
-    spreads = [c for c in examine(group_runs(find_runs(tmp_path)[0])) if "over seeds" in c.what]
+    assert found["1", "mean", "TDC", "SAC"].verdict == "undecided"
+    assert found["1", "mean", "TDC", "MEOW"].verdict == "undecided: too few seeds"
+    assert found["2", "scatter", "TDC", "SAC"].verdict == "undecided: too few seeds"  # of one evaluation each
+    spreads = [c for c in examine_folder(tmp_path) if "over seeds" in c.what]
     assert {c.verdict for c in spreads} == {"undecided: too few seeds"}  # 1 [0.5, 6.3] and 500 [260, 3142], of three
 
 
@@ -78,7 +141,7 @@ def test_ten_seeds_decide_about_a_spread(tmp_path):
     make_runs(tmp_path, range(100, 110))
     make_runs(tmp_path, range(0, 1000, 100), algo="sac")
     make_runs(tmp_path, range(50, 60), algo="td3")
-    spreads = {c.sides[1]: c for c in examine(group_runs(find_runs(tmp_path)[0])) if "over seeds" in c.what}
+    spreads = {c.sides[1]: c for c in examine_folder(tmp_path) if "over seeds" in c.what}
     assert spreads["SAC"].verdict == "held"
     assert spreads["TD3"].verdict == "undecided"
     assert spreads["SAC"].other.value == pytest.approx(302.77, abs=0.01)
@@ -105,7 +168,7 @@ def test_what_hyperparams_say_is_what_is_judged(tmp_path):
         of_that_length = {"n_timesteps": steps, "learning_starts": steps // 10, "steps": steps}
         make_runs(tmp_path / "as_shipped", (100, 101), **of_that_length)
         make_runs(tmp_path / "as_shipped", (50, 51), algo="td3", **of_that_length)
-    assert len([c for c in compare(tmp_path / "as_shipped").values() if c.says.startswith("1")]) == 2
+    assert len(number(1, tmp_path / "as_shipped")) == 2
 
 
 def test_runs_of_another_length_are_not_compared(tmp_path):
@@ -116,19 +179,24 @@ def test_runs_of_another_length_are_not_compared(tmp_path):
 
 def test_the_largest_lam_against_the_smallest(tmp_path):
     for lam, spread in ((0.0, 300.0), (0.5, 100.0), (0.9, 1.0)):
-        make_runs(tmp_path, (*(500 - spread, 500 + spread) * 5, 500), lam=lam)
-    (found,) = (c for c in compare(tmp_path).values() if c.says.startswith("3"))
+        make_runs(tmp_path, (*(500 - spread, 500 + spread) * 5, 500), env_id="HalfCheetah-v4", lam=lam)
+    (found,) = number(3, tmp_path)
     assert (found.ours.value, found.other.value, found.verdict) == (pytest.approx(1), pytest.approx(300), "held")
 
 
+def test_a_small_lam_is_not_the_paper_s_larger_one(tmp_path):
+    for lam in (0.0, 0.5):
+        make_runs(tmp_path, (1, 2, 3), env_id="HalfCheetah-v4", lam=lam)
+    assert number(3, tmp_path) == []
+
+
 def test_td_errors_late_in_training(tmp_path):
-    for lam, variances in ((0.0, (1e9, 1e9, 100.0, 100.0, 100.0)), (0.9, (1e-9, 1e-9, 10.0, 10.0, 10.0))):
-        for seed in (1, 2, 3):
-            log = {"train/td_error_var": np.array(variances) * 1.01**seed}
-            make_run(tmp_path, seed=seed, lam=lam, returns=((1.0,),), log=log)
-    (found,) = (c for c in compare(tmp_path).values() if c.says.startswith("5"))
-    assert found.ours.value == pytest.approx(1 + 2 * np.log10(1.01))  # the first two thirds do not count
-    assert found.other.value == pytest.approx(2 + 2 * np.log10(1.01))
+    variants = {0.0: (1e9, 1e9, 1e2, 1e2, 1e2), 1.0: (1e-9, 1e-9, 10, 10, 10), 3.0: (1e-9, 1e-9, 1e-5, 1e-5, 1e-5)}
+    for lam, variances in variants.items():
+        make_runs(tmp_path, (1.0, 1.0, 1.0), lam=lam, log={"train/td_error_var": variances})
+    (found,) = number(5, tmp_path)
+    assert (found.ours.value, found.other.value) == pytest.approx((1, 2))  # the first two thirds do not count
+    assert found.sides == ("TDC, λ 1", "TDC, λ 0")
     assert found.verdict == "held"
 
 

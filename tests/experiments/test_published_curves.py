@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from sb3_tdc.experiments import figures, tables
+from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.published_curves import PublishedCurve, published_curves
-from sb3_tdc.experiments.results import find_runs, group_runs
+from sb3_tdc.experiments.results import find_runs
 from tests.helpers.run_folders import make_run
 
 
@@ -49,7 +50,7 @@ def test_the_table_compares_at_our_number_of_steps(tmp_path):
         )
     make_run(tmp_path, algo="sac", env_id="Pendulum-v1", steps=1000)  # nothing is published for it
     table = tables.make_published_curves_table(group_runs(find_runs(tmp_path)[0]))
-    assert set(table["Environment"]) == {"Hopper-v4"}
+    assert {name.split(",")[0] for name in table["Environment"]} == {"Hopper-v4"}
     assert set(table["Steps"]) == {"100,000"}
     rows = {row["Algorithm"]: row for row in table.to_dict("records")}
     # 2100 ± 12.706·√(20000)/√2 of two seeds

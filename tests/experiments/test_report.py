@@ -6,13 +6,17 @@ import markupsafe
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib import figure
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import evaluate, train
 from sb3_tdc.cli import report as report_command
-from sb3_tdc.experiments import curves, figures, final_episodes, provenance, report, sections, tables
-from sb3_tdc.experiments.results import Run, find_runs, group_runs
+from sb3_tdc.experiments import aggregate, curves, figures, final_episodes, provenance, report, sections, tables
+from sb3_tdc.experiments.groups import group_runs
+from sb3_tdc.experiments.results import Run, find_runs
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.trained import TrainedModel
 from tests.helpers.run_folders import make_run
 
@@ -70,7 +74,7 @@ def test_numbers_to_read():
 def test_published_returns_are_those_of_the_sources(tmp_path):
     make_run(tmp_path, seed=1, returns=((100.0,),))
     table = tables.make_published_table(tables.make_returns_table(read_groups(tmp_path))).set_index("Algorithm")
-    assert len(table) == 14 + 1
+    assert len(table) == 15 + 1
     assert table.index[:2].tolist() == ["TDC: this report", "TDC-λ: the GeZo-SAC paper"]
     assert table.loc["TDC: this report", ["Hopper", "Ant", "Steps", "Seeds"]].tolist() == ["100", "–", "1,000", "1"]
     tianshou = table.loc["SAC: Tianshou's examples/mujoco"]
@@ -159,29 +163,64 @@ def test_bins_scale_with_the_run_but_hold_an_evaluation(tmp_path):
     assert width(n_timesteps=150_000, args={"eval_freq": 1_500}) == 1_500  # nearest multiple of 2,000
 
 
+def make_shipped(folder, algo, env_id, finals, steps=1000):
+    shipped, _ = read_entry(hyperparams_file(algo), env_id)
+    for seed, final in enumerate(finals, 1):
+        config = {**shipped, "n_timesteps": steps, "learning_starts": steps // 10}
+        make_run(folder, algo, env_id, seed=seed, steps=steps, returns=((final,),), **config)
+
+
 def test_scores_over_tasks_need_two_seeds_of_everything(tmp_path):
     for env_id in ("Hopper-v4", "Walker2d-v4"):
-        for seed in (1, 2):
-            make_run(tmp_path, env_id=env_id, seed=seed, returns=((10.0 * seed,),), lam=1.0)
-            make_run(tmp_path, algo="sac", env_id=env_id, seed=seed, returns=((10.0 * seed - 10,),))
-    make_run(tmp_path, algo="td3", seed=1)  # one seed: not among them
-    found = sections.Report(read_groups(tmp_path), tmp_path).scores()
-    assert set(found) == {"TDC", "SAC"}
+        make_shipped(tmp_path, "tdc", env_id, (10, 20))
+        make_shipped(tmp_path, "sac", env_id, (0, 10))
+        make_shipped(tmp_path, "sac", env_id, (500, 600), steps=400)  # of another length
+    make_shipped(tmp_path, "td3", "Hopper-v4", (1, 2))
+    make_shipped(tmp_path, "td3", "Walker2d-v4", (1,))  # one seed
+    (found,) = aggregate.aggregate(read_groups(tmp_path))
+    assert (found.length, found.env_ids, found.left_out) == ("1,000 steps", ("Hopper-v4", "Walker2d-v4"), ("TD3",))
     # Returns 10 and 20 against 0 and 10
-    assert [scores.tolist() for scores in found["TDC"]] == [[0.5, 1], [0.5, 1]]
-    assert [scores.tolist() for scores in found["SAC"]] == [[0, 0.5], [0, 0.5]]
+    assert {label: [s.tolist() for s in scores] for label, scores in found.scores.items()} == {
+        "TDC": [[0.5, 1], [0.5, 1]],
+        "SAC": [[0, 0.5], [0, 0.5]],
+    }
+    assert [point for point, _, _ in found.intervals()] == [0.75, 0.25]
+    picture = sections.Report(read_groups(tmp_path), tmp_path / "report").returns_section().pictures[0]
+    assert "Not on all of these tasks with two seeds: TD3" in picture.caption
+
+
+def test_full_length_is_one_length_whatever_the_task(tmp_path):
+    for env_id in ("Hopper-v4", "Walker2d-v4"):
+        for algo in ("tdc", "sac"):
+            steps = read_entry(hyperparams_file(algo), env_id)[0]["n_timesteps"]
+            config = {**read_entry(hyperparams_file(algo), env_id)[0]}
+            for seed in (1, 2):
+                make_run(tmp_path, algo, env_id, seed=seed, steps=steps, returns=((1.0,),), **config)
+    (found,) = aggregate.aggregate(read_groups(tmp_path))
+    assert found.length == aggregate.FULL
+
+
+@given(st.dictionaries(st.sampled_from("abcd"), st.lists(st.sampled_from("uvwxyz"), unique=True), max_size=4))
+def test_algorithms_are_chosen_that_share_two_tasks(tasks):
+    labels, common = aggregate.choose(tasks)
+    assert all(set(common) <= set(tasks[label]) for label in labels)
+    assert (len(labels) >= 2 and len(common) >= 2) or (labels, common) == ([], ())
+    if len(tasks) == 2:
+        assert bool(labels) == (len(set.intersection(*map(set, tasks.values()))) > 1)
 
 
 def test_what_is_missing_is_said(tmp_path, monkeypatch):
     others = {name: algorithm for name, algorithm in ALGORITHMS.items() if name != "meow"}
     monkeypatch.setattr(provenance, "ALGORITHMS", others)
-    make_run(tmp_path, seed=1)
-    make_run(tmp_path, seed=2, steps=400)
+    shipped = {**read_entry(hyperparams_file("tdc"), "Hopper-v4")[0], "n_timesteps": 1000, "learning_starts": 100}
+    make_run(tmp_path, seed=1, **shipped)
+    make_run(tmp_path, seed=2, steps=400, **shipped)
+    make_run(tmp_path, seed=4, **{**shipped, "kappa": 3.0})  # not of the paper
     broken = make_run(tmp_path, seed=3)
     (broken.path / "Hopper-v4" / "config.yml").write_text("lam: 0.9")  # no n_timesteps
     runs, unreadable = find_runs(tmp_path)
     page = report.write_report(runs, unreadable, tmp_path / "out").read_text()
-    assert "1 (+ 1 unfinished)" in page
+    assert "1 (1,000 steps), 1 unfinished" in page
     assert "400 of 1,000" in page
     assert "stopped early; the model was saved" in page
     assert str(broken.path) in page
@@ -266,8 +305,17 @@ def test_from_runs_to_a_page(logs, tmp_path, capsys):
     assert "url(" not in page
     assert "<script" not in page
     names = {path.name for path in (tmp_path / "figures").iterdir()}
-    for stem in ("learning-curve-Hopper-v4", "test-returns-Hopper-v4", "lambda-curves-1-Hopper-v4",
-                 "lambda-sweep-1-Hopper-v4", "heads-1-Hopper-v4", "td-error-variance-Hopper-v4"):  # fmt: skip
+    where = read_groups(logs)[0].conditions.file_name
+    assert where.startswith("Hopper-v4-400")
+    figure_names = (
+        "learning-curve",
+        "test-returns",
+        "lambda-curves-1",
+        "lambda-sweep-1",
+        "heads-1",
+        "td-error-variance",
+    )
+    for stem in (f"{name}-{where}" for name in figure_names):
         assert {f"{stem}.{suffix}" for suffix in ("svg", "png", "pdf")} <= names
         assert f"figures/{stem}.svg" in page
     table = (tmp_path / "tables" / "returns.csv").read_text().splitlines()
@@ -276,4 +324,44 @@ def test_from_runs_to_a_page(logs, tmp_path, capsys):
     assert "TDC, stochastic head" in page
     assert all(str(markupsafe.escape(run.command)) in page for run in find_runs(logs)[0])  # as Jinja escapes
     assert "stable-baselines3" in page
-    assert "400 steps; bins of 200 steps. Seeds: TDC: 2 (1, 2); TD3: 2 (1, 2)." in page
+    assert "bins of 200 steps. Seeds: TDC: 2 (1, 2);" in page
+    assert "All TDC: " in page  # the hyperparameters of this test
+
+
+def test_an_earlier_report_leaves_nothing(tmp_path):
+    make_run(tmp_path / "one", lam=0.0, log={"train/td_error_var": [1.0]})
+    make_run(tmp_path / "other", algo="td3")
+    out = tmp_path / "out"
+    report.write_report(*find_runs(tmp_path / "one"), out)
+    (out / "figures" / "mine.txt").write_text("kept")
+    assert any("td-error" in path.name for path in (out / "figures").iterdir())
+    report.write_report(*find_runs(tmp_path / "other"), out)
+    assert not any("td-error" in path.name for path in (out / "figures").iterdir())
+    assert (out / "figures" / "mine.txt").is_file()
+    assert not (out / "tables" / "lambda.csv").exists()
+
+
+def test_seeds_of_several_commits_are_said(tmp_path):
+    for seed, commit in ((1, "aaaaaaaaaa"), (2, "bbbbbbbbbb")):
+        run = make_run(tmp_path, seed=seed)
+        (run.path / run.env_name / "versions.yml").write_text(f"sb3_tdc: {commit}\n")
+    page = report.write_report(*find_runs(tmp_path), tmp_path / "out").read_text()
+    assert "Seeds of 1 group were trained by several commits of sb3_tdc (TDC on Hopper-v4, 1,000 steps)" in page
+    assert "aaaaaaa, bbbbbbb" in page
+
+
+def test_the_steps_of_test_episodes_of_a_board_are_said(tmp_path):
+    make_run(tmp_path, algo="advb_td3", log={"board/test_steps": [100.0, 4321.0]})
+    make_run(tmp_path, algo="td3")
+    said = [text for text in report.warnings(read_groups(tmp_path)) if "board" in text]
+    assert len(said) == 1
+    assert "ADVB_TD3 on Hopper-v4" in said[0]
+    assert "4,321 environment steps of test episodes" in said[0]
+
+
+def test_results_and_logs_make_one_report(tmp_path, capsys):
+    make_run(tmp_path / "results", seed=1)
+    make_run(tmp_path / "logs", seed=2)
+    assert report_command.main([str(tmp_path / "results"), str(tmp_path / "logs")]) == 0
+    page = (tmp_path / "logs" / "report" / "report.html").read_text()
+    assert "TDC: 2 (1, 2)" in page

@@ -3,9 +3,19 @@
 import numpy as np
 import pytest
 
+from sb3_tdc.experiments.groups import (
+    by_conditions,
+    describe,
+    differences,
+    group_runs,
+    is_as_shipped,
+    shared_differences,
+    vary,
+)
 from sb3_tdc.experiments.provenance import list_unfinished
-from sb3_tdc.experiments.results import describe, differences, find_runs, group_runs, vary
+from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.suites import SUITES, Cell
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from tests.helpers.run_folders import NETWORKS, make_run
 
 
@@ -97,13 +107,18 @@ def test_cells_of_the_paper():
     assert [len(SUITES[name]) for name in ("fig2", "fig3", "fig5", "figS1")] == [10, 10, 12, 2]
 
 
-def test_a_run_belongs_to_a_cell_by_lambda_and_head(tmp_path):
-    make_run(tmp_path, lam=0.0)
-    (run,), _ = find_runs(tmp_path)
+def test_a_run_belongs_to_a_cell_by_what_the_cell_varies(tmp_path):
+    shipped, _ = read_entry(hyperparams_file("tdc"), "Hopper-v4")
+    make_run(tmp_path, **{**shipped, "n_timesteps": 1000, "lam": 0.0})
+    make_run(tmp_path, seed=2, **{**shipped, "n_timesteps": 1000, "lam": 0.0, "kappa": 10.0})
+    run, other = find_runs(tmp_path)[0]
     assert Cell("tdc", "Hopper-v4", {"lam": 0.0}).includes(run)
-    assert Cell("tdc", "Hopper-v4", {"stochastic_actor": False}).includes(run)
+    assert not Cell("tdc", "Hopper-v4").includes(run)  # λ is not that of hyperparams/
+    assert not Cell("tdc", "Hopper-v4", {"stochastic_actor": False}).includes(run)
     assert not Cell("tdc", "Hopper-v4", {"lam": 1.0}).includes(run)
     assert not Cell("td3", "Hopper-v4").includes(run)
+    assert not Cell("tdc", "Hopper-v4", {"lam": 0.0}).includes(other)
+    assert Cell("tdc", "Hopper-v4", {"lam": 0.0, "kappa": 10.0}).includes(other)
 
 
 @pytest.mark.parametrize("name", ["evaluations.npz", "Hopper-v4.zip"])
@@ -145,8 +160,63 @@ def test_runs_with_other_contacts_are_not_averaged(tmp_path):
     for seed, mujoco in ((1, "3.4.0"), (2, "4.0.0"), (3, "3.5.1"), (4, "3.2.7")):
         run = make_run(tmp_path, seed=seed, returns=((1.0,),))
         (run.path / run.env_name / "versions.yml").write_text(f"mujoco: {mujoco}\n")
-    groups = {group.label: group.seeds for group in group_runs(find_runs(tmp_path)[0])}
-    assert groups == {"TDC, MuJoCo before 3.5": "2 (1, 4)", "TDC, MuJoCo since 3.5": "2 (2, 3)"}
+    groups = {(g.label, g.conditions.mujoco): g.seeds for g in group_runs(find_runs(tmp_path)[0])}
+    assert groups == {("TDC", "before 3.5"): "2 (1, 4)", ("TDC", "since 3.5"): "2 (2, 3)"}
+
+
+@pytest.mark.parametrize("env_id", ["HopperBulletEnv-v0", "Isaac-Repose-Cube-Allegro-v0", "Pendulum-v1"])
+def test_mujoco_matters_to_its_own_tasks_alone(tmp_path, env_id):
+    for seed, mujoco in ((1, "3.4.0"), (2, "4.0.0")):
+        run = make_run(tmp_path, env_id=env_id, seed=seed)
+        (run.path / run.env_name / "versions.yml").write_text(f"mujoco: {mujoco}\n")
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert group.seeds == "2 (1, 2)"
+
+
+def test_what_is_compared_has_one_length(tmp_path):
+    for steps in (1000, 400):
+        make_run(tmp_path, n_timesteps=steps, steps=steps)
+        make_run(tmp_path, n_timesteps=steps, steps=steps, lam=0.0)
+    found = by_conditions(group_runs(find_runs(tmp_path)[0]))
+    assert [(conditions.n_timesteps, [g.label for g in groups]) for conditions, groups in found.items()] == [
+        (400, ["TDC", "TDC, λ 0"]),
+        (1000, ["TDC", "TDC, λ 0"]),
+    ]
+
+
+def test_as_shipped_whatever_the_length(tmp_path):
+    shipped, _ = read_entry(hyperparams_file("tdc"), "Hopper-v4")
+    base = {**shipped, "n_timesteps": 1000}
+    for seed, changed in enumerate(({}, {"learning_starts": 100}, {"learning_starts": 99}, {"kappa": 2.0})):
+        make_run(tmp_path, seed=seed, **{**base, **changed})
+    make_run(tmp_path, seed=4, args={"eval_freq": 7, "eval_episodes": 1}, **base)
+    found = {run.seed: is_as_shipped(run) for run in find_runs(tmp_path)[0]}
+    assert found == {0: True, 1: True, 2: False, 3: False, 4: True}
+    other = next(run for run in find_runs(tmp_path)[0] if run.seed == 3)
+    assert is_as_shipped(other, but={"kappa"})
+
+
+def test_what_all_of_an_algorithm_have_is_said_once(tmp_path):
+    for lam in (0.0, 0.5):
+        make_run(tmp_path, lam=lam, tau=0.25)
+    make_run(tmp_path, algo="td3", batch_size=7)
+    groups = group_runs(find_runs(tmp_path)[0])
+    said = shared_differences(groups)
+    assert "tau 0.25" in said
+    assert "λ" not in said
+    assert "all TD3: " in said
+    assert "batch_size 7" in said
+    assert "steps" not in said
+
+
+def test_of_several_folders_the_last_counts(tmp_path):
+    make_run(tmp_path / "results", seed=1, returns=((1.0,),))
+    make_run(tmp_path / "logs", seed=1, returns=((2.0,),))
+    make_run(tmp_path / "logs", seed=2, returns=((3.0,),))
+    (group,) = group_runs(find_runs(tmp_path / "results", tmp_path / "logs")[0])
+    assert group.final_returns.tolist() == [2, 3]
+    with pytest.raises(ValueError, match=r"There are no runs in .*nothing"):
+        find_runs(tmp_path / "results", tmp_path / "nothing")
 
 
 def test_a_run_whose_hyperparameters_were_changed_is_another_experiment(tmp_path):

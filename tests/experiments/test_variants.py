@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sb3_tdc.experiments import sections, statistics, tables
-from sb3_tdc.experiments.results import find_runs, group_runs
+from sb3_tdc.experiments.groups import group_runs
+from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.variants import compare_variants
 from tests.helpers.run_folders import HOPPER, make_run
 
@@ -82,6 +83,37 @@ def test_many_variants_need_more(tmp_path):
     assert {round(c.p, 6) for c in found.values()} == {round(4 * alone, 6)}
 
 
+def test_a_variant_may_be_worse(tmp_path):
+    make_runs(tmp_path, [(10.0, 10.0), (20.0, 20.0), (0.0, 0.0)], lam=0.5)
+    make_runs(tmp_path, [(99.0, 101.0), (109.0, 111.0), (90.0, 90.0)], lam=0.0)
+    (found,) = compare(tmp_path).values()
+    assert found.verdict == "worse"
+
+
+def test_variants_of_another_length_are_counted_for_themselves(tmp_path):
+    for steps in (1000, 400):
+        of_length = {"n_timesteps": steps, "steps": steps}
+        make_runs(tmp_path, [(0.0, 0.0), (10.0, 10.0), (20.0, 20.0)], lam=0.0, **of_length)
+        make_runs(tmp_path, [(25.0, 25.0), (35.0, 35.0), (45.0, 45.0)], lam=0.5, **of_length)
+    found = compare_variants(group_runs(find_runs(tmp_path)[0]))
+    alone = 2 * stats.t.sf(25 / np.sqrt(200 / 3), 4)
+    assert [c.p for c in found] == pytest.approx([alone, alone])
+
+
+def test_ablations_are_drawn_next_to_their_control(tmp_path):
+    pytest.importorskip("matplotlib")
+    make_runs(tmp_path / "logs", [(1.0, 2.0), (2.0, 3.0)])
+    make_runs(tmp_path / "logs", [(1.0, 2.0)], algo="tdc-shift")
+    make_runs(tmp_path / "logs", [(1.0, 2.0)], algo="sac")
+    groups = group_runs(find_runs(tmp_path / "logs")[0])
+    report = sections.Report(groups, tmp_path / "report")
+    (picture,) = report.lambda_sweep().pictures
+    assert picture.name == f"variants-{groups[0].conditions.file_name}"
+    assert "TDC: 2 (1, 2); TDC-SHIFT: 1 (1)." in picture.caption
+    (picture,) = report.learning_curves().pictures
+    assert "TDC: 2 (1, 2); SAC: 1 (1)." in picture.caption
+
+
 def test_one_seed_decides_nothing(tmp_path):
     make_runs(tmp_path, [(1.0, 1.0)], lam=0.5)
     make_runs(tmp_path, [(0.0, 0.0)], lam=0.0)
@@ -93,7 +125,9 @@ def test_a_calibrated_lam_has_its_curve_next_to_the_numbers(tmp_path):
     pytest.importorskip("matplotlib")
     for lam in (0.0, 0.5, "auto"):
         make_runs(tmp_path / "logs", [(1.0, 2.0), (2.0, 3.0)], lam=lam)
-    section = sections.Report(group_runs(find_runs(tmp_path / "logs")[0]), tmp_path / "report").lambda_sweep()
-    assert [picture.name for picture in section.pictures] == ["lambda-curves-1-Hopper-v4", "lambda-sweep-1-Hopper-v4"]
+    groups = group_runs(find_runs(tmp_path / "logs")[0])
+    section = sections.Report(groups, tmp_path / "report").lambda_sweep()
+    where = groups[0].conditions.file_name
+    assert [picture.name for picture in section.pictures] == [f"lambda-curves-1-{where}", f"lambda-sweep-1-{where}"]
     assert "λ = auto: 2 (1, 2)" in section.pictures[0].caption
     assert (tmp_path / "report" / "tables" / "variants.csv").is_file()
