@@ -1,0 +1,166 @@
+"""Runs → groups that may be averaged, and what may be compared."""
+
+import pytest
+
+from sb3_tdc.experiments.groups import (
+    by_conditions,
+    describe,
+    differences,
+    group_runs,
+    is_as_shipped,
+    shared_differences,
+    vary,
+)
+from sb3_tdc.experiments.provenance import list_unfinished
+from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from tests.helpers.run_folders import NETWORKS, make_run
+
+
+def labels(folder):
+    return [(group.label, [run.seed for run in group.runs]) for group in group_runs(find_runs(folder)[0])]
+
+
+def test_only_seeds_are_put_together(tmp_path):
+    for seed in (2, 1, 3):
+        make_run(tmp_path, seed=seed)
+    make_run(tmp_path, seed=1, lam=0.5)
+    make_run(tmp_path, seed=1, stochastic_actor=True)
+    make_run(tmp_path, seed=1, policy_kwargs={**NETWORKS, "n_quantiles": 8})
+    make_run(tmp_path, seed=1, args={"env_kwargs": {"reset_noise_scale": 0.0}})
+    make_run(tmp_path, algo="td3", seed=1)
+    assert labels(tmp_path) == [
+        ("TDC", [1, 2, 3]),
+        ("TDC, env_kwargs.reset_noise_scale 0", [1]),
+        ("TDC, n_quantiles 8", [1]),
+        ("TDC, stochastic head", [1]),
+        ("TDC, λ 0.5", [1]),
+        ("TD3", [1]),
+    ]
+
+
+def test_what_is_said_and_what_is_the_default_are_the_same(tmp_path):
+    make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2, gamma=0.99, stochastic_actor=False)  # the constructor's own
+    make_run(tmp_path, seed=3, kappa=1)  # not 1.0, but the same
+    assert labels(tmp_path) == [("TDC", [1, 2, 3])]
+
+
+def test_a_repetition_is_no_other_seed(tmp_path):
+    make_run(tmp_path, seed=1, returns=((1.0,),))
+    make_run(tmp_path, seed=1, returns=((2.0,),))
+    make_run(tmp_path, seed=1, returns=((3.0,),), steps=None)
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    (run,) = group.runs
+    assert run.evaluations.returns.tolist() == [[2.0]]  # the last finished one
+
+
+def test_only_finished_runs_count(tmp_path):
+    make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2, steps=400)
+    make_run(tmp_path, seed=3, steps=None)
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert [run.steps for run in group.runs] == [1000, 400, 500]
+    assert group.seeds == "1 (1)"
+
+
+def test_ablations_differ_in_one_setting_alone(tmp_path):
+    make_run(tmp_path, lam=1.0)
+    make_run(tmp_path, lam=0.25)
+    make_run(tmp_path, lam=0.25, kappa=2.0)
+    make_run(tmp_path, env_id="Ant-v4", lam=0.5)
+    groups = group_runs(find_runs(tmp_path)[0])
+    assert [[group.setting("lam") for group in some] for some in vary(groups, "lam")] == [[0.25, 1.0]]
+    assert [[group.setting("kappa") for group in some] for some in vary(groups, "kappa")] == [[1.0, 2.0]]
+    assert vary(groups, "stochastic_actor") == []
+
+
+def test_what_differs_from_the_hyperparameter_file_is_named(tmp_path):
+    make_run(tmp_path, lam=0.5, learning_starts=100)
+    (run,), _ = find_runs(tmp_path)
+    text = describe(differences(run))
+    assert "steps 1,000" in text
+    assert "λ 0.5" in text
+    assert "learning_starts 100" in text
+    assert "learning_rate" not in text
+    assert "gamma" not in text
+
+
+def test_a_run_that_a_callback_ended_is_finished_for_all_but_not_averaged(tmp_path):
+    """``train.py`` marks its runs; how many steps they have matters to averages alone."""
+    folder = make_run(tmp_path, steps=400, args={"resume_freq": 100})
+    assert not find_runs(tmp_path)[0][0].is_finished
+    folder.mark_finished(400)
+    (run,), _ = find_runs(tmp_path)
+    assert (run.is_finished, run.folder.is_finished, run.steps, run.n_timesteps) == (True, True, 400, 1000)
+    (group,) = group_runs([run])
+    assert group.finished == ()
+    (row,) = list_unfinished([run], []).to_dict("records")
+    assert (row["Steps"], row["Why"]) == ("400 of 1,000", "a callback ended it early")
+
+
+def test_runs_with_other_contacts_are_not_averaged(tmp_path):
+    for seed, mujoco in ((1, "3.4.0"), (2, "4.0.0"), (3, "3.5.1"), (4, "3.2.7")):
+        run = make_run(tmp_path, seed=seed, returns=((1.0,),))
+        (run.path / run.env_name / "versions.yml").write_text(f"mujoco: {mujoco}\n")
+    groups = {(g.label, g.conditions.mujoco): g.seeds for g in group_runs(find_runs(tmp_path)[0])}
+    assert groups == {("TDC", "before 3.5"): "2 (1, 4)", ("TDC", "since 3.5"): "2 (2, 3)"}
+
+
+@pytest.mark.parametrize("env_id", ["HopperBulletEnv-v0", "Isaac-Repose-Cube-Allegro-v0", "Pendulum-v1"])
+def test_mujoco_matters_to_its_own_tasks_alone(tmp_path, env_id):
+    for seed, mujoco in ((1, "3.4.0"), (2, "4.0.0")):
+        run = make_run(tmp_path, env_id=env_id, seed=seed)
+        (run.path / run.env_name / "versions.yml").write_text(f"mujoco: {mujoco}\n")
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert group.seeds == "2 (1, 2)"
+
+
+def test_what_is_compared_has_one_length(tmp_path):
+    for steps in (1000, 400):
+        make_run(tmp_path, n_timesteps=steps, steps=steps)
+        make_run(tmp_path, n_timesteps=steps, steps=steps, lam=0.0)
+    found = by_conditions(group_runs(find_runs(tmp_path)[0]))
+    assert [(conditions.n_timesteps, [g.label for g in groups]) for conditions, groups in found.items()] == [
+        (400, ["TDC", "TDC, λ 0"]),
+        (1000, ["TDC", "TDC, λ 0"]),
+    ]
+
+
+def test_as_shipped_whatever_the_length(tmp_path):
+    shipped, _ = read_entry(hyperparams_file("tdc"), "Hopper-v4")
+    base = {**shipped, "n_timesteps": 1000}
+    for seed, changed in enumerate(({}, {"learning_starts": 100}, {"learning_starts": 99}, {"kappa": 2.0})):
+        make_run(tmp_path, seed=seed, **{**base, **changed})
+    make_run(tmp_path, seed=4, args={"eval_freq": 7, "eval_episodes": 1}, **base)
+    found = {run.seed: is_as_shipped(run) for run in find_runs(tmp_path)[0]}
+    assert found == {0: True, 1: True, 2: False, 3: False, 4: True}
+    other = next(run for run in find_runs(tmp_path)[0] if run.seed == 3)
+    assert is_as_shipped(other, but={"kappa"})
+
+
+def test_what_all_of_an_algorithm_have_is_said_once(tmp_path):
+    for lam in (0.0, 0.5):
+        make_run(tmp_path, lam=lam, tau=0.25)
+    make_run(tmp_path, algo="td3", batch_size=7)
+    groups = group_runs(find_runs(tmp_path)[0])
+    said = shared_differences(groups)
+    assert "tau 0.25" in said
+    assert "λ" not in said
+    assert "all TD3: " in said
+    assert "batch_size 7" in said
+    assert "steps" not in said
+
+
+def test_a_run_whose_hyperparameters_were_changed_is_another_experiment(tmp_path):
+    make_run(tmp_path, seed=1, lam=0.5)
+    changed = make_run(tmp_path, seed=2, lam=0.5)
+    (changed.path / changed.env_name / "changes.yml").write_text("changes:\n- {step: 100, lam: 0.5}\n")
+    assert sorted(group.seeds for group in group_runs(find_runs(tmp_path)[0])) == ["1 (1)", "1 (2)"]
+
+
+def test_of_two_runs_of_one_seed_the_later_one_counts_after_nine_too(tmp_path):
+    for i in range(1, 12):
+        make_run(tmp_path, seed=1, returns=((float(i),),))
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert group.runs[0].folder.path.name == "Hopper-v4_11"
