@@ -43,8 +43,9 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     (target / "args.yml").write_text(plain_yaml.dump(arguments))
     command = _without_programs(run.command).replace(str(source.args["log_folder"]), relative)
     (target / "command.txt").write_text(f"{command}\n")
-    log = pd.read_csv(source.path / "progress.csv")
-    _thin(log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
+    (place / "progress.csv").unlink(missing_ok=True)
+    if len(run.log):
+        _thin(run.log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
     return place
 
 

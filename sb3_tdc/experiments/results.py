@@ -129,6 +129,14 @@ class Run:
             return None
         return Evaluations(*read_arrays(path, "timesteps", "results"))
 
+    @property
+    def log(self) -> pd.DataFrame:
+        """``progress.csv``, empty if there is none."""
+        try:
+            return pd.read_csv(self.folder.path / "progress.csv")
+        except (FileNotFoundError, pd.errors.EmptyDataError):
+            return pd.DataFrame()
+
     def progress(self, *columns: str) -> np.ndarray:
         """
         Read columns of the log.
@@ -136,12 +144,8 @@ class Run:
         :param columns: of ``progress.csv``
         :return: (rows,), or (rows, columns) of several, where all of them are known
         """
-        nothing = np.empty((0, len(columns)))
-        try:
-            table = pd.read_csv(self.folder.path / "progress.csv")
-        except (FileNotFoundError, pd.errors.EmptyDataError):
-            table = pd.DataFrame()
-        values = table[list(columns)].dropna().to_numpy() if set(columns) <= set(table) else nothing
+        log = self.log
+        values = log[list(columns)].dropna().to_numpy() if set(columns) <= set(log) else np.empty((0, len(columns)))
         return values[:, 0] if len(columns) == 1 else values
 
     def late(self, column: str) -> np.ndarray:

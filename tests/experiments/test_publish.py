@@ -122,3 +122,22 @@ def test_test_returns_of_another_model_do_not_stay(logs, tmp_path):
     publish.main([str(copy), "-o", str(results)])
     assert list(results.rglob(final_episodes.FILE)) == []
     assert len(list(results.rglob("evaluations.npz"))) == 1
+
+
+def test_a_run_without_a_log_is_published(logs, tmp_path):
+    copy = tmp_path / "logs"
+    shutil.copytree(logs, copy)
+    for content in (None, ""):
+        log = next(path.parent for path in copy.rglob("evaluations.npz")) / "progress.csv"
+        log.unlink() if content is None else log.write_text(content)
+        assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 0
+        (run,), unreadable = find_runs(tmp_path / "results")
+        assert (unreadable, len(run.log)) == ([], 0)
+
+
+def test_results_are_not_published_over_the_runs(logs, capsys):
+    before = {path: path.read_bytes() for path in logs.rglob("*") if path.is_file()}
+    with pytest.raises(SystemExit):
+        publish.main([str(logs), "-o", str(logs / ".." / logs.name)])
+    assert "-o must be another folder" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in logs.rglob("*") if path.is_file()}
