@@ -122,33 +122,43 @@ def _split_version(env_id: str) -> tuple[str, int]:
     return (base, int(version)) if base and version.isdecimal() else (env_id, -1)
 
 
-def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> Hyperparams:
+def parse(
+    entry: dict[str, Any],
+    algorithm: type[BaseAlgorithm],
+    where: str,
+    overrides: dict[str, Any] | None = None,
+    where_overrides: str = "",
+) -> Hyperparams:
     """
     Check every key and value of an entry against the algorithm's constructor.
 
     :param entry: as read from the file
     :param algorithm: its constructor's annotations are the schema
     :param where: the file and the environment, for the error
+    :param overrides: values that replace those of the entry; what depends on several keys is checked on all together
+    :param where_overrides: where these were given, for the error
     :raises ValueError: naming the key, what it was, what is allowed, and the nearest known key
     """
+    overrides = overrides or {}
     hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _FLAGS}
     hints.update(_RUN_KEYS)
-    values = _convert_mapping(entry, hints, where)
+    replaced = {key: value for key, value in entry.items() if key not in overrides}
+    values = _convert_mapping(replaced, hints, where) | _convert_mapping(overrides, hints, where_overrides)
+
+    def place(*keys: str) -> str:
+        return where_overrides if any(key in overrides for key in keys) else where
+
     if "n_timesteps" not in values:
         raise ValueError(f"{where}: n_timesteps is missing")
     for key in ("n_timesteps", "n_envs", "frame_stack"):
         if values.get(key) is not None and values[key] < 1:
-            raise ValueError(f"{where}: {key} must be at least 1, got {values[key]}")
-    if isinstance(sigmas := values.get("noise_std"), list) and (
-        len(sigmas) != 2 or values.get("noise_type") != "normal"
-    ):
-        raise ValueError(f"{where}: noise_std must be a number, or two with noise_type normal, got {sigmas}")
-    if values.get("noise_type") not in (None, *_NOISE_TYPES):
-        raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {values['noise_type']!r}")
-    _convert_policy(values, algorithm, where)
+            raise ValueError(f"{place(key)}: {key} must be at least 1, got {values[key]}")
+    _check_noise(values, place("noise_type", "noise_std"))
+    _convert_policy(values, algorithm, place("policy"), place("policy_kwargs"))
     if "monitor_kwargs" in values:
         hints = {key: hint for key, hint in constructor_hints(Monitor).items() if key not in ("env", "filename")}
-        values["monitor_kwargs"] = _convert_mapping(values["monitor_kwargs"], hints, f"{where}: monitor_kwargs")
+        where_kwargs = f"{place('monitor_kwargs')}: monitor_kwargs"
+        values["monitor_kwargs"] = _convert_mapping(values["monitor_kwargs"], hints, where_kwargs)
 
     run = {key: values.pop(key) for key in _RUN_KEYS if key in values}
     normalize = run.pop("normalize", False)
@@ -156,12 +166,12 @@ def parse(entry: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> 
         options = normalize if isinstance(normalize, dict) else {}
         normalize = {"gamma": values.get("gamma", 0.99), **options}
     for key in ("env_wrapper", "vec_env_wrapper"):
-        run[key] = _factories(run.get(key), f"{where}: {key}")
+        run[key] = _factories(run.get(key), f"{place(key)}: {key}")
     return Hyperparams(
-        raw=dict(entry),
+        raw={**entry, **overrides},
         model=values,
         normalize=normalize or None,
-        callbacks=_factories(run.pop("callback", None), f"{where}: callback"),
+        callbacks=_factories(run.pop("callback", None), f"{place('callback')}: callback"),
         **run,
     )
 
@@ -194,7 +204,15 @@ def _convert_mapping(mapping: dict[str, Any], hints: dict[str, Any], where: str)
     return converted
 
 
-def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], where: str) -> None:
+def _check_noise(values: dict[str, Any], where: str) -> None:
+    noise_type, sigmas = values.get("noise_type"), values.get("noise_std")
+    if noise_type not in (None, *_NOISE_TYPES):
+        raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {noise_type!r}")
+    if isinstance(sigmas, list) and (len(sigmas) != 2 or noise_type != "normal"):
+        raise ValueError(f"{where}: noise_std must be a number, or two with noise_type normal, got {sigmas}")
+
+
+def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], where: str, where_kwargs: str) -> None:
     """Resolve the policy, and check ``policy_kwargs`` against its constructor."""
     policy = values.setdefault("policy", "MlpPolicy")
     if isinstance(policy, str) and "." in policy:
@@ -208,7 +226,7 @@ def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], wher
         policy = algorithm.policy_aliases[policy]
     if values.get("policy_kwargs"):
         hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in POLICY_ARGUMENTS}
-        values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, f"{where}: policy_kwargs")
+        values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, f"{where_kwargs}: policy_kwargs")
 
 
 def _convert(value: Any, hint: Any) -> Any:

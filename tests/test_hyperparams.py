@@ -217,3 +217,29 @@ def test_files_that_cannot_be_used(tmp_path, text, message):
 
 def test_suggestions_need_not_exist():
     assert suggest("zzz", ["lam", "kappa"]) == ""
+
+
+def test_what_depends_on_several_keys_is_checked_on_all_of_them_together():
+    entry = {"n_timesteps": 1, "noise_type": "normal", "noise_std": 0.1, "policy": "CnnPolicy"}
+    overrides = {"noise_std": [0.1, 0.4], "policy_kwargs": {"net_arch": [8]}}
+    h = parse(entry, TDC, "file.yml", overrides, "command line")
+    assert (h.noise_type, h.noise_std) == ("normal", [0.1, 0.4])
+    assert h.raw == {**entry, **overrides}
+    assert parse(entry, TDC, "file.yml", {"noise_type": None, "noise_std": 0}, "command line").noise_type is None
+    with pytest.raises(ValueError, match="command line: noise_std must be a number, or two with noise_type normal"):
+        parse({**entry, "noise_std": [0.1, 0.4]}, TDC, "file.yml", {"noise_type": "ornstein-uhlenbeck"}, "command line")
+
+
+@pytest.mark.parametrize(
+    ("entry", "overrides", "where"),
+    [
+        ({"gamma": "high"}, {"tau": 0.1}, "file.yml"),
+        ({"tau": 0.1}, {"gamma": "high"}, "command line"),
+        ({"policy_kwargs": {"foo": 1}}, {"policy": "CnnPolicy"}, "file.yml"),
+        ({"policy": "CnnPolicy"}, {"policy_kwargs": {"foo": 1}}, "command line"),
+    ],
+)
+def test_a_mistake_is_named_with_its_source(entry, overrides, where):
+    with pytest.raises(ValueError, match=f"^{where}: "):
+        parse({"n_timesteps": 1, **entry}, TDC, "file.yml", overrides, "command line")
+    assert parse({"n_timesteps": 1, "gamma": "high"}, TDC, "file.yml", {"gamma": 0.9}, "command line").n_timesteps == 1

@@ -59,9 +59,9 @@ def check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
 
     :raises ValueError: if the algorithm does not take them
     """
-    entry, _ = read_entry(hyperparams_file(algo), env_id)
-    parse({"n_timesteps": 1, **settings}, ALGORITHMS[algo], "--search and -params")
-    hyperparams = parse({**entry, **settings}, ALGORITHMS[algo], "--search and -params")
+    entry, name = read_entry(hyperparams_file(algo), env_id)
+    where = f"{hyperparams_file(algo)}, {name}"
+    hyperparams = parse(entry, ALGORITHMS[algo], where, settings, "--search and -params")
     try:
         with closing(make_envs(env_id, hyperparams, seed=1, n_envs=hyperparams.n_envs)) as env:
             ALGORITHMS[algo](env=env, device="cpu", **{**hyperparams.model, "buffer_size": 1_000})

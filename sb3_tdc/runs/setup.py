@@ -19,6 +19,8 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, flags_of, plain_arguments
 from sb3_tdc.runs.training import TrainingRun
 
+_COMMAND_LINE = "command line (-params)"
+
 
 def make_run(settings: RunSettings) -> TrainingRun:
     """
@@ -52,11 +54,8 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
         raise ValueError(f"--preset: {path} has no entry {settings.preset}")
     n_timesteps = {"n_timesteps": settings.n_timesteps} if settings.n_timesteps > 0 else {}
     overrides = {**settings.hyperparams, **n_timesteps}
-    algorithm = ALGORITHMS[settings.algo]
     where = f"{path}, {name}"
-    parse({"n_timesteps": 1, **entry}, algorithm, where)  # so that an error names its source
-    parse({"n_timesteps": 1, **overrides}, algorithm, "command line (-params)")
-    hyperparams = parse({**entry, **overrides}, algorithm, where)
+    hyperparams = parse(entry, ALGORITHMS[settings.algo], where, overrides, _COMMAND_LINE)
     if settings.verbose > 0:
         nearest = "" if name == "default" else "; this is the nearest version"
         other = "" if name == wanted else f" (it has no entry for {settings.env}{nearest})"
@@ -123,8 +122,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     where, config = str(folder.path / folder.env_name / "config.yml"), folder.config
     changed = given.get("hyperparams", {})
     differing = {name: value for name, value in changed.items() if name not in config or config[name] != value}
-    parse({"n_timesteps": 1, **differing}, ALGORITHMS[settings.algo], "command line (-params)")
-    hyperparams = parse({**config, **differing}, ALGORITHMS[settings.algo], where)
+    hyperparams = parse(config, ALGORITHMS[settings.algo], where, differing, _COMMAND_LINE)
     set_random_seed(settings.seed)
     return TrainingRun(settings, hyperparams, folder, tuple(differing))
 
