@@ -7,10 +7,11 @@ Knows neither the command line nor environments.
 import collections.abc
 import importlib
 import inspect
+import math
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.common.checks import suggest
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest
 
 # What an entry may say besides the keyword arguments of the algorithm, with its type
 _RUN_KEYS: dict[str, Any] = {
@@ -37,6 +38,10 @@ _RUN_KEYS: dict[str, Any] = {
     "monitor_kwargs": dict[str, Any],
     "noise_type": str | None,
     "noise_std": float | list[float],
+}
+_RUN_LIMITS: Limits = {
+    **dict.fromkeys(("n_timesteps", "n_envs", "frame_stack"), (1, math.inf)),
+    "noise_std": (0.0, math.inf),
 }
 # Keyword arguments that belong to one run, not to an environment: train.py has flags for them
 _FLAGS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
@@ -143,18 +148,19 @@ def parse(
     hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _FLAGS}
     hints.update(_RUN_KEYS)
     replaced = {key: value for key, value in entry.items() if key not in overrides}
-    values = _convert_mapping(replaced, hints, where) | _convert_mapping(overrides, hints, where_overrides)
+    limits = {**getattr(algorithm, "limits", OFF_POLICY_LIMITS), **_RUN_LIMITS}
+    values = {
+        **_convert_mapping(replaced, hints, where, limits),
+        **_convert_mapping(overrides, hints, where_overrides, limits),
+    }
 
     def place(*keys: str) -> str:
         return where_overrides if any(key in overrides for key in keys) else where
 
     if "n_timesteps" not in values:
         raise ValueError(f"{where}: n_timesteps is missing")
-    for key in ("n_timesteps", "n_envs", "frame_stack"):
-        if values.get(key) is not None and values[key] < 1:
-            raise ValueError(f"{place(key)}: {key} must be at least 1, got {values[key]}")
     _check_noise(values, place("noise_type", "noise_std"))
-    _convert_policy(values, algorithm, place("policy"), place("policy_kwargs"))
+    _convert_policy(values, algorithm, place("policy"), place("policy_kwargs"), limits)
     if "monitor_kwargs" in values:
         hints = {key: hint for key, hint in constructor_hints(Monitor).items() if key not in ("env", "filename")}
         where_kwargs = f"{place('monitor_kwargs')}: monitor_kwargs"
@@ -191,7 +197,9 @@ def constructor_hints(cls: type) -> dict[str, Any]:
     return hints
 
 
-def _convert_mapping(mapping: dict[str, Any], hints: dict[str, Any], where: str) -> dict[str, Any]:
+def _convert_mapping(
+    mapping: dict[str, Any], hints: dict[str, Any], where: str, limits: Limits | None = None
+) -> dict[str, Any]:
     converted = {}
     for key, value in mapping.items():
         if key not in hints:
@@ -201,7 +209,21 @@ def _convert_mapping(mapping: dict[str, Any], hints: dict[str, Any], where: str)
         except (TypeError, ValueError, OverflowError) as error:
             detail = f" ({error})" if str(error) else ""
             raise ValueError(f"{where}: {key} must be {_describe(hints[key])}, got {value!r}{detail}") from error
+        if limits and key in limits:
+            for number in _numbers_in(converted[key]):
+                check_within(limits, key, number, f"{where}: {key}")
     return converted
+
+
+def _numbers_in(value: Any) -> Iterator[float]:
+    """Return a number, the number that a schedule begins with, or those in a list or a mapping."""
+    if isinstance(value, LinearSchedule):
+        yield value(1.0)
+    elif isinstance(value, (list, tuple, dict)):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _numbers_in(part)
+    elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        yield value
 
 
 def _check_noise(values: dict[str, Any], where: str) -> None:
@@ -212,7 +234,9 @@ def _check_noise(values: dict[str, Any], where: str) -> None:
         raise ValueError(f"{where}: noise_std must be a number, or two with noise_type normal, got {sigmas}")
 
 
-def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], where: str, where_kwargs: str) -> None:
+def _convert_policy(
+    values: dict[str, Any], algorithm: type[BaseAlgorithm], where: str, where_kwargs: str, limits: Limits
+) -> None:
     """Resolve the policy, and check ``policy_kwargs`` against its constructor."""
     policy = values.setdefault("policy", "MlpPolicy")
     if isinstance(policy, str) and "." in policy:
@@ -226,7 +250,8 @@ def _convert_policy(values: dict[str, Any], algorithm: type[BaseAlgorithm], wher
         policy = algorithm.policy_aliases[policy]
     if values.get("policy_kwargs"):
         hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in POLICY_ARGUMENTS}
-        values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, f"{where_kwargs}: policy_kwargs")
+        where_kwargs = f"{where_kwargs}: policy_kwargs"
+        values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, where_kwargs, limits)
 
 
 def _convert(value: Any, hint: Any) -> Any:

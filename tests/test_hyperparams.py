@@ -169,7 +169,20 @@ def test_values_become_what_the_constructor_wants():
         ({"replay_buffer_class": "no.such.Buffer"}, "there is no module 'no'"),
         ({"policy": "MlpPolic"}, "unknown policy 'MlpPolic'; did you mean 'MlpPolicy'?"),
         ({"noise_type": "pink"}, "noise_type must be one of normal, ornstein-uhlenbeck, got 'pink'"),
-        ({"n_envs": 0}, "n_envs must be at least 1, got 0"),
+        ({"n_envs": 0}, "n_envs must be an integer of at least 1, got 0"),
+        ({"noise_type": "normal", "noise_std": -0.1}, "noise_std must be a finite number of at least 0.0, got -0.1"),
+        ({"noise_std": float("nan")}, "noise_std must be a finite number of at least 0.0, got nan"),
+        ({"noise_type": "normal", "noise_std": [0.1, -1]}, "noise_std must be a finite number of at least 0.0, got -1"),
+        ({"train_freq": 0}, "file.yml, Env-v0: train_freq must be an integer of at least 1, got 0"),
+        ({"train_freq": [0, "episode"]}, "train_freq must be an integer of at least 1, got 0"),
+        ({"tau": 1.5}, "tau must be a finite number between 0.0 and 1.0, got 1.5"),
+        ({"lam": -1}, "file.yml, Env-v0: lam must be a finite number of at least 0.0, got -1"),
+        ({"learning_rate": "lin_-1e-3"}, "learning_rate must be a finite number of at least 0.0, got -0.001"),
+        (
+            {"policy_kwargs": {"net_arch": [64, -3]}},
+            "file.yml, Env-v0: policy_kwargs: net_arch must be an integer of at least 1, got -3",
+        ),
+        ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [0]}}}, "net_arch must be an integer of at least 1, got 0"),
         ({"env_wrapper": "print"}, "env_wrapper must name a class"),
         ({"callback": {"a.B": {}, "c.D": {}}}, "callback must name a class, or map it to its keyword arguments"),
     ],
@@ -179,6 +192,14 @@ def test_mistakes_are_named(entry, message):
     with pytest.raises(ValueError, match=re.escape(message)) as error:
         parse_tdc(entry)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("entry", [{"batch_size": 0}, {"gamma": 1.01}, {"buffer_size": -5}, {"learning_starts": -1}])
+def test_numbers_are_checked_for_every_algorithm(algo, entry):
+    """SB3's own constructors take any."""
+    with pytest.raises(ValueError, match=f"file.yml, Env-v0: {next(iter(entry))} must be "):
+        parse_tdc(entry, ALGORITHMS[algo])
 
 
 def test_another_algorithm_has_another_schema():

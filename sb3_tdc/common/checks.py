@@ -2,12 +2,25 @@
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from torch import nn
+
+# The smallest and the largest number that an argument may be: of integers, if the smallest is one
+Limits = Mapping[str, tuple[float, float]]
+_POSITIVE, _NOT_NEGATIVE = (1, math.inf), (0.0, math.inf)
+# Of the off-policy algorithms of SB3 and their policies
+OFF_POLICY_LIMITS: Limits = {
+    **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "policy_delay"), _POSITIVE),
+    **dict.fromkeys(("target_update_interval", "stats_window_size", "net_arch", "n_critics"), _POSITIVE),
+    **dict.fromkeys(("learning_rate", "ent_coef", "target_policy_noise", "target_noise_clip"), _NOT_NEGATIVE),
+    **dict.fromkeys(("tau", "gamma"), (0.0, 1.0)),
+    "learning_starts": (0, math.inf),
+    "gradient_steps": (-1, math.inf),
+}
 
 
 def _allowed(kind: str, minimum: float, maximum: float) -> str:
@@ -51,6 +64,21 @@ def check_integer(name: str, value: Any, minimum: int) -> int:
     if not math.isfinite(number) or number != int(number) or number < minimum:
         raise ValueError(f"{name} must be {_allowed('an integer', minimum, math.inf)}, got {value!r}")
     return int(number)
+
+
+def check_within(limits: Limits, name: str, value: Any, shown_as: str = "") -> float:
+    """
+    Check a number against what an argument may be.
+
+    :param name: of the argument, a key of the limits
+    :param shown_as: the argument in the error, its name by default
+    :return: the value, a number or an integer
+    :raises ValueError: if it is anything else
+    """
+    minimum, maximum = limits[name]
+    if isinstance(minimum, int):
+        return check_integer(shown_as or name, value, minimum)
+    return check_number(shown_as or name, value, minimum, maximum)
 
 
 def find_non_finite(network: nn.Module, weights: dict[str, Any]) -> list[str]:

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_tdc.common.checks import check_integer, check_number, find_non_finite
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_number, check_within, find_non_finite
 from sb3_tdc.common.diagnostics import Diagnostics, NonFiniteError
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
@@ -25,6 +25,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     A subclass calls ``diagnose`` at its updates and ``_record_training`` after them, and declares
 
+    - in ``limits``, which numbers its arguments may be,
     - in ``schedules``, its arguments that may be schedules,
     - in ``saved_fields``, what its saved models hold besides SB3's own fields,
     - in ``captured_attributes``, what a resumed run needs of that which saved models leave out,
@@ -32,6 +33,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
     - in ``color``, how figures draw it.
     """
 
+    limits: ClassVar[Limits] = OFF_POLICY_LIMITS
     schedules: ClassVar[tuple[str, ...]] = ("learning_rate",)
     saved_fields: ClassVar[dict[str, SavedField]] = {}
     captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics",)
@@ -41,17 +43,18 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
     # ---------------------------------------------------------------- arguments
 
     def _check_arguments(self) -> None:
-        for name in ("tau", "gamma"):
-            setattr(self, name, check_number(name, getattr(self, name), 0.0, 1.0))
-        minima = {"learning_starts": 0, "gradient_steps": -1}
-        for name in ("buffer_size", "batch_size", "n_steps", *minima):
-            setattr(self, name, check_integer(name, getattr(self, name), minima.get(name, 1)))
+        self._check_limits("tau", "gamma", "buffer_size", "batch_size", "n_steps", "learning_starts", "gradient_steps")
         for name in self.schedules:
             value = self.scheduled(name, progress_remaining=1.0)
             given = getattr(self, name)
             if given is not None and not callable(given) and not isinstance(given, str):
                 setattr(self, name, value)
         self._convert_train_freq()
+        check_within(self.limits, "train_freq", self.train_freq.frequency)  # type: ignore[union-attr]
+
+    def _check_limits(self, *names: str) -> None:
+        for name in names:
+            setattr(self, name, check_within(self.limits, name, getattr(self, name)))
 
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
         """The current value of one of ``schedules``, checked."""

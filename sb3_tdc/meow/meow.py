@@ -1,5 +1,6 @@
 """MEOW as a Stable-Baselines3 algorithm: soft Q-learning whose Q-functions and policy are one normalising flow."""
 
+import math
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -12,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update, update_learning_rate
 from torch import nn
 
-from sb3_tdc.common.checks import check_action_space, check_integer, check_number
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, integer, number
 from sb3_tdc.meow.policies import CnnPolicy, MEOWPolicy, MlpPolicy, MultiInputPolicy
@@ -60,6 +61,12 @@ class MEOW(CheckedOffPolicyAlgorithm):
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
+    }
+    limits: ClassVar[Limits] = {
+        **OFF_POLICY_LIMITS,
+        **dict.fromkeys(("shift_arch", "n_shifts", "n_blocks"), (1, math.inf)),
+        "max_grad_norm": (0.0, math.inf),
+        "dropout": (0.0, 1.0),
     }
     saved_fields: ClassVar[dict[str, SavedField]] = {
         "ent_coef": SavedField(number(above=0.0)),
@@ -137,9 +144,8 @@ class MEOW(CheckedOffPolicyAlgorithm):
         for name in ("ent_coef", "max_grad_norm"):
             setattr(self, name, _check_positive(name, getattr(self, name)))
         arguments = self.policy_kwargs
-        for name in ("n_shifts", "n_blocks"):
-            check_integer(f"policy_kwargs[{name!r}]", arguments.get(name, 1), 1)
-        check_number("policy_kwargs['dropout']", arguments.get("dropout", 0.0), 0.0, 1.0)
+        for name in ("n_shifts", "n_blocks", "dropout"):
+            check_within(self.limits, name, arguments.get(name, 1), f"policy_kwargs[{name!r}]")
         low, high = arguments.get("log_std_min", -5.0), arguments.get("log_std_max", -0.3)
         low = check_number("policy_kwargs['log_std_min']", low)
         check_number("policy_kwargs['log_std_max']", high, low)

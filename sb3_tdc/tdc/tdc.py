@@ -1,6 +1,7 @@
 """TDC-λ as a Stable-Baselines3 algorithm. ``train()`` follows Algorithm 1 of the paper, phase by phase."""
 
 import io
+import math
 import pathlib
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
@@ -18,7 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
 
-from sb3_tdc.common.checks import check_action_space, check_integer, check_number
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
 from sb3_tdc.common.dormant import dormant_share, relu_activations
 from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.common.noise import noise_of_all
@@ -125,6 +126,11 @@ class TDC(CheckedOffPolicyAlgorithm):
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
+    }
+    limits: ClassVar[Limits] = {
+        **OFF_POLICY_LIMITS,
+        **dict.fromkeys(("lam", "kappa", "qf_learning_rate"), (0.0, math.inf)),
+        "n_quantiles": (1, math.inf),
     }
     schedules: ClassVar[tuple[str, ...]] = ("lam", "learning_rate", "qf_learning_rate")
     least_lam: ClassVar[float] = 0.0  # of a calibration
@@ -247,13 +253,11 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        for name in ("kappa", "target_policy_noise", "target_noise_clip"):
-            setattr(self, name, check_number(name, getattr(self, name), 0.0))
-        self.policy_delay = check_integer("policy_delay", self.policy_delay, 1)
+        self._check_limits("kappa", "target_policy_noise", "target_noise_clip", "policy_delay")
         if isinstance(self.lam, str):
             initial_lam(self.lam)
         for name in ("n_quantiles", "n_critics"):
-            check_integer(f"policy_kwargs[{name!r}]", self.policy_kwargs.get(name, 1), 1)
+            check_within(self.limits, name, self.policy_kwargs.get(name, 1), f"policy_kwargs[{name!r}]")
         if self.target_entropy != "auto":
             check_number('target_entropy (if not "auto")', self.target_entropy)
         self._initial_ent_coef()

@@ -347,6 +347,7 @@ def test_diagnostics_by_hand():
         ({"tau": 1.5}, "tau must be a finite number between 0.0 and 1.0, got 1.5"),
         ({"gamma": -0.5}, "gamma must be .* got -0.5"),
         ({"batch_size": 0}, "batch_size must be .* got 0"),
+        ({"train_freq": (0, "episode")}, "train_freq must be an integer of at least 1, got 0"),
         ({"gradient_steps": -2}, "gradient_steps must be an integer of at least -1, got -2"),
         ({"target_policy_noise": -0.2}, "target_policy_noise must be .* got -0.2"),
         ({"action_noise": -0.1}, "action_noise .* must be .* got -0.1"),
