@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 _FLOAT = "tag:yaml.org,2002:float"
+_MERGE = "tag:yaml.org,2002:merge"
 _PYTHON = "tag:yaml.org,2002:python"
 _NUMBER = re.compile(
     r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*|[0-9][0-9_]*(?=[eE]))(?:[eE][-+]?[0-9]+)?"
@@ -27,9 +28,19 @@ def _resolvers(base: Any) -> dict[str, Any]:
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values, and the ordered mappings and tuples in RL Zoo's run folders."""
+    """Plain values, and the ordered mappings and tuples in RL Zoo's run folders; no key twice in one mapping."""
 
     yaml_implicit_resolvers = _resolvers(yaml.SafeLoader)
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+                if (key.tag, key.value) in seen:
+                    raise yaml.YAMLError(f"line {key.start_mark.line + 1} gives {key.value} a second time")
+                seen.add((key.tag, key.value))
+        return node
 
 
 class _Dumper(yaml.SafeDumper):
@@ -64,7 +75,7 @@ class _UntrustedLoader(_Loader):
         return super().compose_node(parent, index)
 
     def flatten_mapping(self, node: Any) -> None:
-        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+        if any(key.tag == _MERGE for key, _ in node.value):
             raise yaml.YAMLError("merges are not read from a run folder")
 
 

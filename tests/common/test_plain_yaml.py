@@ -49,6 +49,14 @@ def test_what_is_written_is_read(value):
     assert yaml.safe_load(plain_yaml.dump(value)) == value  # by the readers of RL Zoo too
 
 
+def test_a_key_that_is_given_twice_is_refused_with_its_line():
+    with pytest.raises(ValueError, match=r"my.yml is not YAML of plain values: line 3 gives lam a second time"):
+        plain_yaml.load("A-v0:\n  lam: 1\n  lam: 2", "my.yml")
+    # What is merged is overruled, not given twice, also where a mapping that merges is merged
+    text = "a: &a {x: 1, y: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: *b, x: 3, 1: 4, '1': 5}"
+    assert plain_yaml.load(text, "")["c"] == {"x": 3, "y": 1, 1: 4, "1": 5}
+
+
 def test_every_place_reads_numbers_alike(tmp_path):
     args = make_parser().parse_args(
         ["--env-kwargs", "a:{b: [1e-3]}", "--eval-env-kwargs", "a:1e3", "-params", "policy_kwargs:{log_std_init: -3e0}"]
