@@ -21,9 +21,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest, unknown
 
 # What an entry may say besides the keyword arguments of the algorithm, with its type
 _RUN_KEYS: dict[str, Any] = {
@@ -43,12 +44,18 @@ _RUN_LIMITS: Limits = {
     **dict.fromkeys(("n_timesteps", "n_envs", "frame_stack"), (1, math.inf)),
     "noise_std": (0.0, math.inf),
 }
-# Keyword arguments that belong to one run, not to an environment: train.py has flags for them
-_FLAGS = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+# Keyword arguments that belong to one run, not to an environment, and the flags of train.py for them
+_FLAGS = {name: f"--{name.replace('_', '-')}" for name in ("env", "seed", "device", "verbose", "tensorboard_log")}
+_NO_HYPERPARAMETERS = {*_FLAGS, "self", "_init_setup_model"}
 # What the algorithm itself passes to the policy
 POLICY_ARGUMENTS = {"self", "observation_space", "action_space", "lr_schedule"}
 # Where a class may be named without its module
 _CLASS_MODULES = ("torch.nn", "torch.optim", "stable_baselines3", "stable_baselines3.common.buffers")
+# Whose keyword arguments a mapping holds, and those that are not the user's
+_OPTIONS: dict[str, tuple[type, tuple[str, ...]]] = {
+    "normalize": (VecNormalize, ("venv",)),
+    "monitor_kwargs": (Monitor, ("env", "filename")),
+}
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 
 
@@ -90,10 +97,11 @@ def hyperparams_file(algo: str) -> Path:
     return (installed if installed.is_dir() else checkout) / f"{algo.partition('-')[0]}.yml"
 
 
-def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], str]:
+def read_entry(path: Path, env_id: str, preset: str | None = None) -> tuple[dict[str, Any], str]:
     """
     The entry of an environment, or else of its nearest version, with the file's ``default`` merged under it.
 
+    :param preset: the name of an entry to take instead
     :return: the entry and its name in the file: ``default`` if there is none of any version
     :raises ValueError: if the file cannot be read, or has neither an entry nor a default
     """
@@ -103,7 +111,9 @@ def read_entry(path: Path, env_id: str) -> tuple[dict[str, Any], str]:
         raise ValueError(f"{path}: {getattr(error, 'strerror', None) or 'is not a text'}") from error
     if not isinstance(entries, dict) or not all(isinstance(e, dict) for e in entries.values()):
         raise ValueError(f"{path} must map environment ids to hyperparameters")
-    name = _nearest_version(env_id, entries)
+    if preset is not None and preset not in entries:
+        raise ValueError(f"{path}: {unknown('entry', preset, map(str, entries))}")
+    name = preset or _nearest_version(env_id, entries)
     if name not in entries:
         raise ValueError(f"{path} has no entry for {env_id} and no default{suggest(env_id, entries)}")
     return {**entries.get("default", {}), **entries[name]}, name
@@ -145,7 +155,7 @@ def parse(
     :raises ValueError: naming the key, what it was, what is allowed, and the nearest known key
     """
     overrides = overrides or {}
-    hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _FLAGS}
+    hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _NO_HYPERPARAMETERS}
     hints.update(_RUN_KEYS)
     replaced = {key: value for key, value in entry.items() if key not in overrides}
     limits = {**getattr(algorithm, "limits", OFF_POLICY_LIMITS), **_RUN_LIMITS}
@@ -161,10 +171,10 @@ def parse(
         raise ValueError(f"{where}: n_timesteps is missing")
     _check_noise(values, place("noise_type", "noise_std"))
     _convert_policy(values, algorithm, place("policy"), place("policy_kwargs"), limits)
-    if "monitor_kwargs" in values:
-        hints = {key: hint for key, hint in constructor_hints(Monitor).items() if key not in ("env", "filename")}
-        where_kwargs = f"{place('monitor_kwargs')}: monitor_kwargs"
-        values["monitor_kwargs"] = _convert_mapping(values["monitor_kwargs"], hints, where_kwargs)
+    for key, (cls, others) in _OPTIONS.items():
+        if isinstance(values.get(key), dict):
+            hints = {name: hint for name, hint in constructor_hints(cls).items() if name not in ("self", *others)}
+            values[key] = _convert_mapping(values[key], hints, f"{place(key)}: {key}")
 
     run = {key: values.pop(key) for key in _RUN_KEYS if key in values}
     normalize = run.pop("normalize", False)
@@ -203,7 +213,7 @@ def _convert_mapping(
     converted = {}
     for key, value in mapping.items():
         if key not in hints:
-            raise ValueError(f"{where}: unknown key {key!r}{suggest(str(key), hints)}")
+            raise ValueError(f"{where}: {_unknown_key(key, hints)}")
         try:
             converted[key] = _convert(value, hints[key])
         except (TypeError, ValueError, OverflowError) as error:
@@ -213,6 +223,12 @@ def _convert_mapping(
             for number in _numbers_in(converted[key]):
                 check_within(limits, key, number, f"{where}: {key}")
     return converted
+
+
+def _unknown_key(key: Any, known: Iterable[str]) -> str:
+    if key in _FLAGS:
+        return f"{key} is no hyperparameter: it has a flag, {_FLAGS[key]}"
+    return f"unknown key {key!r}{suggest(str(key), known) or '; known: ' + ', '.join(known)}"
 
 
 def _numbers_in(value: Any) -> Iterator[float]:
@@ -246,7 +262,7 @@ def _convert_policy(
             raise ValueError(f"{where}: policy: {error}") from error
     if isinstance(policy, str):
         if policy not in algorithm.policy_aliases:
-            raise ValueError(f"{where}: unknown policy {policy!r}{suggest(policy, algorithm.policy_aliases)}")
+            raise ValueError(f"{where}: {unknown('policy', policy, algorithm.policy_aliases)}, or module.Class")
         policy = algorithm.policy_aliases[policy]
     if values.get("policy_kwargs"):
         hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in POLICY_ARGUMENTS}

@@ -147,7 +147,16 @@ def test_values_become_what_the_constructor_wants():
     [
         ({"learning_rte": 1}, "file.yml, Env-v0: unknown key 'learning_rte'; did you mean 'learning_rate'?"),
         ({"Lam": 1}, "unknown key 'Lam'; did you mean 'lam'?"),
-        ({"seed": 1}, "unknown key 'seed'"),
+        ({"seed": 1}, "file.yml, Env-v0: seed is no hyperparameter: it has a flag, --seed"),
+        ({"zzz": 1}, "unknown key 'zzz'; known: policy, learning_rate, buffer_size, "),
+        (
+            {"normalize": {"foo": None}},
+            "file.yml, Env-v0: normalize: unknown key 'foo'; known: training, norm_obs, norm_reward, clip_obs, "
+            "clip_reward, gamma, epsilon, norm_obs_keys",
+        ),
+        ({"normalize": {"clip_obs": "x"}}, "normalize: clip_obs must be a number, got 'x'"),
+        ({"monitor_kwargs": {"info_keyword": ["a"]}}, "unknown key 'info_keyword'; did you mean 'info_keywords'?"),
+        ({"policy": "Foo"}, "unknown policy 'Foo'; known: MlpPolicy, CnnPolicy, MultiInputPolicy, or module.Class"),
         ({"gamma": "high"}, "file.yml, Env-v0: gamma must be a number, got 'high'"),
         ({"batch_size": 2.5}, "batch_size must be an integer, got 2.5"),
         ({"batch_size": float("inf")}, "batch_size must be an integer, got inf"),
@@ -234,6 +243,14 @@ def test_files_that_cannot_be_used(tmp_path, text, message):
     with pytest.raises(ValueError, match=r"my\.yml") as error:
         read_entry(path, "Hoper-v4")
     assert message in str(error.value)
+
+
+def test_a_preset_is_an_entry_and_never_a_version_of_one(tmp_path):
+    path = tmp_path / "my.yml"
+    path.write_text("default: {n_timesteps: 7}\nA-v0: {lam: 0.2}\n")
+    assert read_entry(path, "B-v0", "A-v0") == ({"n_timesteps": 7, "lam": 0.2}, "A-v0")
+    with pytest.raises(ValueError, match=r"my.yml: unknown entry 'A-v1'; did you mean 'A-v0'\?; known: default, A-v0"):
+        read_entry(path, "A-v0", "A-v1")
 
 
 def test_suggestions_need_not_exist():

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.common.checks import suggest
+from sb3_tdc.common.checks import suggest, unknown
 from sb3_tdc.common.commands import command
 from sb3_tdc.runs.settings import RunSettings, default_of, flags_of
 
@@ -93,9 +93,7 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
 
     def check(name: str) -> str:
         if name not in known:
-            raise argparse.ArgumentTypeError(
-                f"unknown {kind} {name!r}{suggest(name, known)}; known: {', '.join(known)}"
-            )
+            raise argparse.ArgumentTypeError(unknown(kind, name, known))
         return name
 
     return check

@@ -125,3 +125,9 @@ def suggest(name: str, known: Iterable[str]) -> str:
     by_lower = {str(k).lower(): k for k in known}
     nearest = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
     return f"; did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    """Return what is wrong with a name: it is unknown, the nearest known one, and all of them."""
+    known = list(known)
+    return f"unknown {kind} {name!r}{suggest(name, known)}; known: {', '.join(known)}"

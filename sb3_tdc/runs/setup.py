@@ -48,17 +48,14 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
     :raises ValueError: naming the source of what is not allowed
     """
     path = settings.conf_file or hyperparams_file(settings.algo)
-    wanted = settings.preset or settings.env
-    entry, name = read_entry(path, wanted)
-    if settings.preset not in (None, name):
-        raise ValueError(f"--preset: {path} has no entry {settings.preset}")
+    entry, name = read_entry(path, settings.env, settings.preset)
     n_timesteps = {"n_timesteps": settings.n_timesteps} if settings.n_timesteps > 0 else {}
     overrides = {**settings.hyperparams, **n_timesteps}
     where = f"{path}, {name}"
     hyperparams = parse(entry, ALGORITHMS[settings.algo], where, overrides, _COMMAND_LINE)
     if settings.verbose > 0:
         nearest = "" if name == "default" else "; this is the nearest version"
-        other = "" if name == wanted else f" (it has no entry for {settings.env}{nearest})"
+        other = "" if name in (settings.preset, settings.env) else f" (it has no entry for {settings.env}{nearest})"
         print(f"Hyperparameters: {where}{other}")
         print(textwrap.indent(plain_yaml.dump(hyperparams.raw, sort_keys=False), "  "), end="")
     return hyperparams
