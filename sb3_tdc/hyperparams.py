@@ -160,8 +160,8 @@ def parse(
     replaced = {key: value for key, value in entry.items() if key not in overrides}
     limits = {**getattr(algorithm, "limits", OFF_POLICY_LIMITS), **_RUN_LIMITS}
     values = {
-        **_convert_mapping(replaced, hints, where, limits),
-        **_convert_mapping(overrides, hints, where_overrides, limits),
+        **convert_mapping(replaced, hints, where, limits),
+        **convert_mapping(overrides, hints, where_overrides, limits),
     }
 
     def place(*keys: str) -> str:
@@ -174,7 +174,7 @@ def parse(
     for key, (cls, others) in _OPTIONS.items():
         if isinstance(values.get(key), dict):
             hints = {name: hint for name, hint in constructor_hints(cls).items() if name not in ("self", *others)}
-            values[key] = _convert_mapping(values[key], hints, f"{place(key)}: {key}")
+            values[key] = convert_mapping(values[key], hints, f"{place(key)}: {key}")
 
     run = {key: values.pop(key) for key in _RUN_KEYS if key in values}
     normalize = run.pop("normalize", False)
@@ -207,9 +207,17 @@ def constructor_hints(cls: type) -> dict[str, Any]:
     return hints
 
 
-def _convert_mapping(
+def convert_mapping(
     mapping: dict[str, Any], hints: dict[str, Any], where: str, limits: Limits | None = None
 ) -> dict[str, Any]:
+    """
+    Return the values as their annotations want them.
+
+    :param hints: the annotation of every key that is known
+    :param where: for the error
+    :param limits: of numbers, also of those inside of a value
+    :raises ValueError: naming the key, what it was and what is allowed
+    """
     converted = {}
     for key, value in mapping.items():
         if key not in hints:
@@ -267,7 +275,7 @@ def _convert_policy(
     if values.get("policy_kwargs"):
         hints = {key: hint for key, hint in constructor_hints(policy).items() if key not in POLICY_ARGUMENTS}
         where_kwargs = f"{where_kwargs}: policy_kwargs"
-        values["policy_kwargs"] = _convert_mapping(values["policy_kwargs"], hints, where_kwargs, limits)
+        values["policy_kwargs"] = convert_mapping(values["policy_kwargs"], hints, where_kwargs, limits)
 
 
 def _convert(value: Any, hint: Any) -> Any:
@@ -302,6 +310,8 @@ def _convert(value: Any, hint: Any) -> Any:
         value = plain_yaml.read_notation(value)
     if origin is dict and isinstance(value, dict):
         return {k: _convert(v, args[1]) for k, v in value.items()}
+    if hint is Path and isinstance(value, str):
+        return Path(value)
     if hint is type(None) and value is None:
         return None
     if isinstance(hint, type) and hint is not bool and isinstance(value, hint):
@@ -378,7 +388,14 @@ def _describe(hint: Any) -> str:
         return f"the name of a {args[0].__name__} class"
     if origin in (tuple, list):
         return f"a list of {', '.join(_describe(a) for a in args if a is not Ellipsis)}"
-    simple = {float: "a number", int: "an integer", bool: "true or false", str: "a text", type(None): "null"}
+    simple = {
+        float: "a number",
+        int: "an integer",
+        bool: "true or false",
+        str: "a text",
+        Path: "a path",
+        type(None): "null",
+    }
     simple.update({dict: "a mapping", list: "a list", th.device: "a device"})
     if origin is dict or hint in simple:
         return simple[origin or hint]

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from torch import nn
 
@@ -118,6 +119,24 @@ def check_action_space(action_space: spaces.Space) -> None:
             f"env must have an action space whose width, high − low, is finite in {action_space.dtype}, got "
             f"{action_space}: wrap it in gymnasium.wrappers.RescaleAction or give the Box narrower bounds"
         )
+
+
+def check_device(name: str, device: str) -> None:
+    """
+    Check that PyTorch can compute on a device; SB3 would compute on the CPU where there is no GPU.
+
+    :param name: of the argument, for the error
+    :raises ValueError: if there is no such device here, naming those that there are
+    """
+    n_gpus, has_mps = th.cuda.device_count(), th.backends.mps.is_available()
+    gpus = ["cuda", *(f"cuda:{i}" for i in range(n_gpus))] if n_gpus else []
+    there = ["auto", "cpu", *gpus, *(["mps"] if has_mps else [])]
+    try:
+        kind = "auto" if device == "auto" else th.device(device).type
+    except RuntimeError:
+        kind = ""
+    if not kind or (kind in ("cuda", "mps") and device not in there):
+        raise ValueError(f"{name} must be one of {', '.join(there)} on this machine, got {device!r}")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

@@ -5,12 +5,15 @@ The flags of ``sb3-tdc train``, the run's ``args.yml``, what may change when a r
 compares all come from :class:`RunSettings`.
 """
 
+import math
+from collections.abc import Collection
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.checks import check_device
 from sb3_tdc.resume import DEFAULT_FREQ
 
 # NumPy takes no seed above 2**32, and environments are seeded with this one and a little more
@@ -26,16 +29,29 @@ class Role(Enum):
     RESUMING = "said only when a run is resumed"
 
 
-def setting(*flags: str, default: Any, help: str, role: Role = Role.RUN, minimum: int | None = None, **parsing: Any):  # type: ignore[no-untyped-def]
+def setting(  # type: ignore[no-untyped-def]
+    *flags: str,
+    default: Any,
+    help: str,
+    role: Role = Role.RUN,
+    minimum: int | None = None,
+    maximum: float = math.inf,
+    minus_one: str | None = None,
+    **parsing: Any,
+):
     """
     Declare a setting.
 
     :param flags: on the command line; the name of the setting is the first by default
-    :param minimum: the smallest number allowed; -1, where it is the default, is allowed too
+    :param minimum: the smallest number allowed
+    :param maximum: the largest
+    :param minus_one: what -1 means, which is allowed too then
     :param parsing: further keyword arguments of ``add_argument``
     :return: a field of a dataclass
     """
-    metadata = {"flags": flags, "help": help, "role": role, "minimum": minimum, "parsing": parsing}
+    limits = {"minimum": minimum, "maximum": maximum, "minus_one": minus_one}
+    help += f" (-1: {minus_one})" if minus_one else ""
+    metadata = {"flags": flags, "help": help, "role": role, **limits, "parsing": parsing}
     if isinstance(default, (dict, list)):
         return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -48,9 +64,15 @@ class RunSettings:
     algo: str = setting(default="tdc", help="algorithm", known=("algorithm", ALGORITHMS))
     env: str = setting(default="HalfCheetah-v4", help="environment id")
     n_timesteps: int = setting(
-        "-n", "--n-timesteps", default=-1, minimum=1, help="environment steps (-1: as in the hyperparameters)"
+        *("-n", "--n-timesteps"),
+        default=-1,
+        minimum=1,
+        minus_one="as in the hyperparameters",
+        help="environment steps",
     )
-    seed: int = setting(default=-1, help="seed of all generators (-1: a random one)")
+    seed: int = setting(
+        default=-1, minimum=0, maximum=MAX_SEED, minus_one="a random one", help="seed of all generators"
+    )
     log_folder: str = setting("-f", "--log-folder", "--folder", default="logs", help="folder of all runs")
     gym_packages: list[str] = setting(default=[], help="packages to import, which register environments")
     env_kwargs: dict[str, Any] = setting(default={}, role=Role.EXPERIMENT, help="key:value of the environment")
@@ -76,15 +98,23 @@ class RunSettings:
     )
     trust: bool = setting(default=False, help="let the files of -i run code, as SB3 does")
     eval_freq: int = setting(
-        default=20_000, role=Role.EXPERIMENT, help="environment steps between evaluations (-1: none)"
+        default=20_000,
+        minimum=1,
+        minus_one="none",
+        role=Role.EXPERIMENT,
+        help="environment steps between evaluations",
     )
     eval_episodes: int = setting(default=5, minimum=1, role=Role.EXPERIMENT, help="episodes per evaluation")
     n_eval_envs: int = setting(default=1, minimum=1, help="environments for evaluation")
-    save_freq: int = setting(default=-1, help="environment steps between saved models (-1: only at the end)")
+    save_freq: int = setting(
+        default=-1, minimum=1, minus_one="only at the end", help="environment steps between saved models"
+    )
     save_replay_buffer: bool = setting(default=False, help="save the replay buffer with the model")
     resume_freq: int | None = setting(
         default=None,
-        help=f"environment steps between resume states (-1: none; default: {DEFAULT_FREQ:,}, or 100 an environment)",
+        minimum=1,
+        minus_one="none",
+        help=f"environment steps between resume states, by default {DEFAULT_FREQ:,}, or 100 an environment",
     )
     resume: Path | None = setting(
         default=None,
@@ -95,6 +125,7 @@ class RunSettings:
     from_step: int | None = setting(
         "--from",
         default=None,
+        minimum=0,
         role=Role.RESUMING,
         metavar="STEP",
         help="with --resume: continue from the state of a step",
@@ -105,9 +136,11 @@ class RunSettings:
     tensorboard_log: str | None = setting(
         "-tb", "--tensorboard-log", default=None, help='TensorBoard folder (none given: the run\'s own; "": off)'
     )
-    log_interval: int = setting(default=-1, help="episodes between log entries (-1: 4, 0: no log)")
+    log_interval: int = setting(default=-1, minimum=0, minus_one="4", help="episodes between log entries, 0 for no log")
     uuid: bool = setting("-uuid", "--uuid", default=False, help="a unique name for the run folder")
-    num_threads: int = setting(default=-1, role=Role.PROCESS, help="threads for PyTorch (-1: at most two)")
+    num_threads: int = setting(
+        default=-1, minimum=1, minus_one="at most two", role=Role.PROCESS, help="threads for PyTorch"
+    )
     device: str = setting(default="auto", role=Role.PROCESS, help="PyTorch device (cpu, cuda, ...)")
     progress: bool | None = setting(
         *("-P", "--progress"),
@@ -117,7 +150,7 @@ class RunSettings:
         negation=("--no-progress", "plain lines, also on a terminal"),
     )
     verbose: int = setting(
-        default=1, role=Role.PROCESS, help="0: silent, 1: progress, 2: also SB3's tables and messages"
+        default=1, minimum=0, role=Role.PROCESS, help="0: silent, 1: progress, 2: also SB3's tables and messages"
     )
 
     @property
@@ -145,24 +178,33 @@ def defaults(*roles: Role) -> dict[str, Any]:
     return {each.name: default_of(each) for each in fields(RunSettings) if each.metadata["role"] in roles}
 
 
-def check_settings(settings: RunSettings) -> None:
+def check_settings(settings: RunSettings, stored_in: str = "", given: Collection[str] = ()) -> None:
     """
-    Check the numbers and the model among the settings.
+    Check the numbers, the names and the device among the settings.
 
-    :raises ValueError: naming the first flag with a number that is not allowed
+    :param stored_in: the file that settings were read from, for the error
+    :param given: names of those that were not, but are on the command line
+    :raises ValueError: naming the first setting that is not allowed, what it was and what is allowed
     """
     for each in fields(settings):
-        minimum, value = each.metadata["minimum"], getattr(settings, each.name)
-        if minimum is not None and value < minimum and value != default_of(each):
-            meaning = each.metadata["help"].rpartition(" (")[2].rstrip(")")
-            otherwise = f" (or {meaning})" if meaning.startswith("-1:") else ""
-            raise ValueError(f"{flags_of(each)[0]} must be at least {minimum}{otherwise}, got {value}")
-    if not -1 <= settings.seed <= MAX_SEED:
-        raise ValueError(f"--seed must be 0 to {MAX_SEED} (or -1: a random one), got {settings.seed}")
-    if settings.trained_agent is not None:
-        path = Path(settings.trained_agent)
-        if not (path.suffix == ".zip" and path.is_file()):
-            raise ValueError(f"-i must be the zip of a model, got {path}")
+        shown_as = flags_of(each)[0] if not stored_in or each.name in given else f"{stored_in}: {each.name}"
+        value = getattr(settings, each.name)
+        parsing = each.metadata["parsing"]
+        _, known = parsing.get("known", ("", parsing.get("choices", [value])))
+        if value not in known:
+            raise ValueError(f"{shown_as} must be one of {', '.join(known)}, got {value!r}")
+        _check_number(each, value, shown_as)
+        if each.name == "device":
+            check_device(shown_as, value)
+
+
+def _check_number(declared: Field, value: Any, shown_as: str) -> None:
+    minimum, maximum, minus_one = (declared.metadata[name] for name in ("minimum", "maximum", "minus_one"))
+    if minimum is None or value is None or minimum <= value <= maximum or (minus_one and value == -1):
+        return
+    allowed = f"at least {minimum}" if maximum == math.inf else f"{minimum} to {maximum}"
+    otherwise = f" (or -1: {minus_one})" if minus_one else ""
+    raise ValueError(f"{shown_as} must be {allowed}{otherwise}, got {value}")
 
 
 def plain_arguments(arguments: dict[str, Any]) -> dict[str, Any]:

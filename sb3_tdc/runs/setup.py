@@ -4,6 +4,7 @@ import shutil
 import textwrap
 from dataclasses import fields
 from os.path import abspath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
-from sb3_tdc.hyperparams import Hyperparams, hyperparams_file, parse, read_entry
+from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, flags_of, plain_arguments
 from sb3_tdc.runs.training import TrainingRun
+from sb3_tdc.safe_load.run_files import check_arguments
 
 _COMMAND_LINE = "command line (-params)"
 
@@ -30,9 +32,13 @@ def make_run(settings: RunSettings) -> TrainingRun:
     """
     if settings.from_step is not None or settings.start_over:
         raise ValueError(f"{'--start-over' if settings.start_over else '--from'} goes with --resume RUN_FOLDER")
+    check_settings(settings)
+    if settings.trained_agent is not None:
+        path = Path(settings.trained_agent)
+        if not (path.suffix == ".zip" and path.is_file()):
+            raise ValueError(f"-i must be the zip of a model, got {path}")
     settings.env, settings.gym_packages = split_env_id(settings.env, settings.gym_packages)
     _prepare(settings)
-    check_settings(settings)
     if settings.seed < 0:
         settings.seed = int(np.random.randint(MAX_SEED))
     hyperparams = read_hyperparams(settings)
@@ -128,15 +134,34 @@ def _resumed_settings(folder: RunFolder, given: dict[str, Any]) -> RunSettings:
     """
     Return the settings of a run, with what may differ now.
 
-    :raises ValueError: if something given contradicts them
+    :raises ValueError: if something given contradicts them, or they have been edited and are not allowed
     """
-    stored, now = folder.args, {}
+    where = str(folder.path / folder.env_name / "args.yml")
+    stored, now = _stored_settings(folder, where), {}
     for declared in fields(RunSettings):
         name, flag = declared.name, flags_of(declared)[-1]
         if name in given and declared.metadata["role"] in (Role.PROCESS, Role.RESUMING):
             now[name] = given[name]
-        elif name in given and (value := plain_arguments(given)[name]) != stored.get(name, value):
-            raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {stored[name]}")
-    known = {declared.name for declared in fields(RunSettings)}
+        elif name in given and given[name] != stored.get(name, given[name]):
+            value, before = (plain_arguments(each)[name] for each in (given, stored))
+            raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {before}")
     fresh = {"resume": None, "from_step": None, "start_over": False}
-    return RunSettings(**{**{k: v for k, v in stored.items() if k in known}, **fresh, **now})
+    settings = RunSettings(**{**stored, **fresh, **now})
+    check_settings(settings, where, now)
+    if settings.seed < 0:
+        raise ValueError(f"{where}: seed must be that of the run, got {settings.seed}")
+    return settings
+
+
+def _stored_settings(folder: RunFolder, where: str) -> dict[str, Any]:
+    """
+    Return the settings in a run's ``args.yml``, which may have been edited.
+
+    :raises ValueError: if one is of another type
+    """
+    stored = folder.args
+    check_arguments(stored, ALGORITHMS, where)
+    types = {declared.name: declared.type for declared in fields(RunSettings)}
+    # RL Zoo has further arguments, and null for what is not given
+    known = {name: value for name, value in stored.items() if name in types and value is not None}
+    return convert_mapping(known, types, where)
