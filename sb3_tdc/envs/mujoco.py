@@ -1,7 +1,26 @@
-"""MuJoCo's warnings: each once, on the screen alone."""
+"""MuJoCo's warnings, each once and on the screen alone; and the OpenGL that it imports."""
 
+import importlib
+import os
 import re
 import sys
+
+
+def check_opengl() -> None:
+    """
+    Import MuJoCo, which imports the OpenGL that ``MUJOCO_GL`` names, also where nothing is drawn.
+
+    :raises ValueError: if there is none
+    """
+    named = os.environ.get("MUJOCO_GL")
+    try:
+        importlib.import_module("mujoco")
+    except Exception as error:
+        if named and getattr(error, "name", None) != "mujoco":  # else it is not installed, which its environments say
+            raise ValueError(
+                f"MuJoCo cannot be imported with MUJOCO_GL={named} (from the environment): unset it, or choose "
+                "another of egl, osmesa, glfw"
+            ) from error
 
 
 def print_warnings_once() -> None:
@@ -12,7 +31,7 @@ def print_warnings_once() -> None:
     """
     try:
         import mujoco
-    except ImportError:  # other simulators do without
+    except Exception:  # other simulators do without; an environment that needs it says what is wrong
         return
     if hasattr(mujoco, "set_mju_user_warning"):
         mujoco.set_mju_user_warning(_print)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import gymnasium as gym
 
 from sb3_tdc.envs.isaac import ISAAC
+from sb3_tdc.envs.mujoco import check_opengl
 from sb3_tdc.envs.pybullet import PYBULLET
 from sb3_tdc.envs.simulator import GYMNASIUM, Simulator
 
@@ -17,6 +18,11 @@ SIMULATORS = (PYBULLET, ISAAC, GYMNASIUM)
 def simulator_of(env_id: str) -> Simulator:
     """Return the simulator that provides an environment."""
     return next(simulator for simulator in SIMULATORS if simulator.provides(env_id))
+
+
+def is_of_mujoco(env_id: str) -> bool:
+    """Return whether a registered environment is one of Gymnasium's MuJoCo tasks."""
+    return "mujoco" in str(gym.spec(env_id).entry_point)
 
 
 def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
@@ -49,12 +55,14 @@ def require_env(env_id: str) -> None:
     """
     Let the simulator of an environment register it, and check that it is registered.
 
-    :raises ValueError: if the simulator is not installed, with the command that installs it; if there is no such
-        environment, with the nearest
+    :raises ValueError: if the simulator is not installed, with the command that installs it; if it is MuJoCo and finds
+        no OpenGL; if there is no such environment, with the nearest
     """
     if env_id not in gym.registry:
         simulator_of(env_id).register()
     if env_id in gym.registry:
+        if is_of_mujoco(env_id):
+            check_opengl()
         return
     close = difflib.get_close_matches(env_id, gym.registry, n=3)
     nearest = f"; did you mean {' or '.join(close)}?" if close else "."

@@ -12,16 +12,33 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
+from sb3_tdc.envs.checked import describe_exception
+
 VIDEO_SUFFIXES = (".mp4", ".gif", ".mkv", ".mov", ".avi")
 _GL_BACKENDS = ("egl", "osmesa")
 _TRY_DISPLAY = "import sys, glfw; sys.exit(not glfw.init())"
-_TRY_BACKEND = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
+# GLFW's context is made without a display too; only what draws fails
+_TRY_BACKEND = """
+import mujoco
+context = mujoco.GLContext(16, 16)
+context.make_current()
+mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontScale.mjFONTSCALE_100)
+context.free()
+"""
 
 
 def render_modes(env_id: str) -> set[str]:
-    """Return the modes that an environment can be made with: none if its constructor takes no ``render_mode``."""
-    entry_point = gym.spec(env_id).entry_point
-    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    """
+    Return the modes that an environment can be made with: none if its constructor takes no ``render_mode``.
+
+    :raises ValueError: if what makes it cannot be imported
+    """
+    spec = gym.spec(env_id)
+    entry_point: Any = spec.entry_point or spec.vector_entry_point
+    try:
+        creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    except Exception as error:
+        raise ValueError(f"{env_id} cannot be made: {describe_exception(error)}") from error
     parameters = inspect.signature(creator).parameters.values()
     if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
         return set()
@@ -47,23 +64,30 @@ def choose_gl_backend(is_window: bool = False) -> str:
 
     :param is_window: whether a window is wanted, for which there is a display
     :return: a sentence on what is used
-    :raises ValueError: if nothing works, with the commands that install one
+    :raises ValueError: if what is set does not work, or nothing does, with the commands that install one
     """
-    if os.environ.get("MUJOCO_GL"):
-        return f"Rendering with MUJOCO_GL={os.environ['MUJOCO_GL']} (from the environment)"
+    if named := os.environ.get("MUJOCO_GL"):
+        if not is_window and not _backend_works(named):
+            raise ValueError(
+                f"MuJoCo cannot render with MUJOCO_GL={named} (from the environment): unset it, and what works is found"
+            )
+        return f"Rendering with MUJOCO_GL={named} (from the environment)"
     if is_window or display_works():
         return "Rendering with the display's OpenGL"
     for backend in _GL_BACKENDS:
-        attempt = subprocess.run(
-            [sys.executable, "-c", _TRY_BACKEND], env={**os.environ, "MUJOCO_GL": backend}, capture_output=True
-        )
-        if attempt.returncode == 0:
+        if _backend_works(backend):
             os.environ["MUJOCO_GL"] = backend
             return f"Rendering with MUJOCO_GL={backend} (no display)"
     raise ValueError(
         "MuJoCo cannot render: there is no display, and neither EGL nor OSMesa works. "
         "On Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 (or libosmesa6)"
     )
+
+
+def _backend_works(backend: str) -> bool:
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    attempt = subprocess.run([sys.executable, "-c", _TRY_BACKEND], env=environment, capture_output=True)
+    return attempt.returncode == 0
 
 
 def follow_agent(env: gym.Env) -> None:

@@ -2,6 +2,8 @@
 
 import argparse
 import os
+import subprocess
+import sys
 from typing import ClassVar
 
 import gymnasium as gym
@@ -11,6 +13,7 @@ import pytest
 
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs import rendering
+from tests.helpers.command_line import ROOT
 
 
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4"])
@@ -36,7 +39,37 @@ def test_no_backend_is_said_with_its_remedy(monkeypatch):
     with pytest.raises(ValueError, match=r"neither EGL nor OSMesa works.*apt-get install"):
         rendering.choose_gl_backend()
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    with pytest.raises(ValueError, match=r"MuJoCo cannot render with MUJOCO_GL=osmesa \(from the environment\): unset"):
+        rendering.choose_gl_backend()
+    assert "MUJOCO_GL=osmesa (from the environment)" in rendering.choose_gl_backend(is_window=True)
+    monkeypatch.setattr(rendering, "_TRY_BACKEND", "pass")
     assert "MUJOCO_GL=osmesa (from the environment)" in rendering.choose_gl_backend()
+
+
+def test_glfw_without_a_display_is_said_to_be_none(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(ValueError, match="MuJoCo cannot render with MUJOCO_GL=glfw"):
+        rendering.choose_gl_backend()
+
+
+@pytest.mark.parametrize("options", [[], ["--vec-env", "gymnasium"], ["--vec-env", "subproc"]])
+def test_an_opengl_that_cannot_be_imported_is_a_sentence(tmp_path, options):
+    """In a process of its own: MuJoCo is imported once."""
+    arguments = ["-f", tmp_path, "-n", 50, "--eval-freq", -1, "--verbose", 0, "--device", "cpu", *options]
+
+    def train_on(env_id):
+        command = [sys.executable, "-m", "sb3_tdc", "train", "--env", env_id, *map(str, arguments)]
+        environment = {**os.environ, "MUJOCO_GL": "nothing", "PYTHONPATH": str(ROOT)}
+        return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+    ended = train_on("Hopper-v4")
+    assert ended.returncode == 2
+    assert "error: MuJoCo cannot be imported with MUJOCO_GL=nothing (from the environment): unset it" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert list(tmp_path.iterdir()) == []
+    assert train_on("Pendulum-v1").returncode == 0  # needs none
 
 
 # ---------------------------------------------------------------- environments of all kinds
@@ -157,6 +190,12 @@ def test_an_environment_that_cannot_be_made_is_a_sentence(runs, monkeypatch, cap
 )
 def test_modes(runs, env_id, modes):
     assert rendering.render_modes(env_id) & {"human", "rgb_array"} == modes
+
+
+def test_what_cannot_be_imported_draws_nothing_and_is_named():
+    gym.register("NotThere-v0", "no_such_package:Env")
+    with pytest.raises(ValueError, match="NotThere-v0 cannot be made: ModuleNotFoundError: No module named 'no_such"):
+        rendering.render_modes("NotThere-v0")
 
 
 def test_a_display_that_is_gone_is_not_used(monkeypatch):
