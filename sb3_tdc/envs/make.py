@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 from sb3_tdc.envs.checked import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
 from sb3_tdc.envs.mujoco import print_warnings_once
 from sb3_tdc.envs.processes import ignore_signals
-from sb3_tdc.envs.registry import simulator_of
+from sb3_tdc.envs.registry import has_vector_env, simulator_of
 from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.resume import Restorable
@@ -94,6 +94,8 @@ def _make(wanted: _Wanted) -> VecEnv:
 
 
 def _make_sb3(wanted: _Wanted) -> VecEnv:
+    if gym.spec(wanted.env_id).entry_point is None:
+        raise ValueError(f"{wanted.env_id} is a vector environment: add --vec-env gymnasium")
     is_subproc = wanted.vec_env == "subproc"
     return make_vec_env(
         _maker(wanted.env_id, wanted.hyperparams, ignores_signals=is_subproc),
@@ -112,7 +114,7 @@ def _make_gymnasium(wanted: _Wanted) -> VecEnv:
     if not hasattr(gym.vector, "AutoresetMode"):
         raise ValueError(f"--vec-env gymnasium needs Gymnasium 1.1 or newer: this is {gym.__version__}")
     print_warnings_once()
-    if gym.spec(wanted.env_id).vector_entry_point is not None:
+    if has_vector_env(wanted.env_id):
         wanted.require_no_wrappers()
         vector = gym.make_vec(wanted.env_id, num_envs=wanted.n_envs, **wanted.env_kwargs)
     else:

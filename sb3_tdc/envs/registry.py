@@ -25,6 +25,11 @@ def is_of_mujoco(env_id: str) -> bool:
     return "mujoco" in str(gym.spec(env_id).entry_point)
 
 
+def has_vector_env(env_id: str) -> bool:
+    """Return whether a vector environment of its own is registered for an id."""
+    return gym.spec(env_id).vector_entry_point is not None
+
+
 def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
     """
     Split ``package:Env-v0``.

@@ -6,7 +6,8 @@ Gymnasium gets there depends on the autoreset mode:
 
 - SAME_STEP: the environment has done so; last observation and info are in ``final_obs`` and ``final_info``.
 - NEXT_STEP: the next step would ignore the action of an environment that has ended, return the first observation and a
-  reward of 0. That is no transition, and must not be learnt from: the environment is reset at once instead.
+  reward of 0. That is no transition, and must not be learnt from: the environment is reset at once instead; if all
+  have ended, by that step.
 - DISABLED: the caller has to reset it, which is done here.
 """
 
@@ -39,6 +40,7 @@ class GymnasiumVecEnv(VecEnv):
         self.env = env
         mode = env.metadata.get("autoreset_mode", "NextStep")  # Gymnasium 1.0 has no other, and does not say so
         self.resets_itself = getattr(mode, "value", mode) == "SameStep"
+        self._resets_in_next_step = getattr(mode, "value", mode) == "NextStep"
         if isinstance(env.unwrapped, AsyncVectorEnv) and not env.unwrapped.shared_memory and mode is not _SAME_STEP:
             # Its processes would reset once more in the next step (Gymnasium 1.4)
             raise ValueError(f"{env} without shared memory resets twice: {_REMEDY}")
@@ -49,8 +51,9 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         options = self._common_options()
-        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        seeded: Any = {"seed": seeds, "options": options} if options else {"seed": seeds}
+        # Some take one number only; from it, Gymnasium counts up for the other environments, as SB3 has done here
+        seed = None if self._seeds[0] is None else int(self._seeds[0])
+        seeded: Any = {"seed": seed, "options": options} if options else {"seed": seed}
         observations, infos = self.env.reset(**seeded)
         self._reset_seeds()
         self._reset_options()
@@ -93,6 +96,9 @@ class GymnasiumVecEnv(VecEnv):
         return first, infos
 
     def _reset_some(self, observations: Any, mask: np.ndarray) -> tuple[Any, dict[str, Any]]:
+        if mask.all() and self._resets_in_next_step:  # also where no single one can be reset
+            results = self.env.step(self._actions)
+            return to_numpy(results[0]), results[4]
         before = copy_of(observations)
         results, infos = self.env.reset(options={"reset_mask": mask.copy()})
         results = to_numpy(results)

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
-from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
+from sb3_tdc.envs.registry import has_vector_env, import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import load_model
@@ -32,6 +32,7 @@ class TrainedModel:
     :param env_kwargs: of training; :param eval_env_kwargs: of evaluations, where these differ
     :param normalization: saved statistics of ``VecNormalize``, if it was trained with them
     :param trust: whether its files may run code
+    :param vec_env: "gymnasium" if it was trained in the vector environment that is registered for the id, else "dummy"
     """
 
     path: Path
@@ -42,6 +43,7 @@ class TrainedModel:
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
     normalization: Path | None = None
     trust: bool = False
+    vec_env: str = "dummy"
 
     def make_env(self, seed: int, **env_kwargs: Any) -> VecEnv:
         """
@@ -57,6 +59,7 @@ class TrainedModel:
                 seed,
                 n_envs=1,
                 env_kwargs=env_kwargs,
+                vec_env=self.vec_env,
                 normalization=self.normalization,
                 training=False,
                 trust=self.trust,
@@ -105,6 +108,7 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
         trained.get("eval_env_kwargs") or {},
         _find_normalization(run, path) if hyperparams.normalize is not None else None,
         trust,
+        vec_env="gymnasium" if trained.get("vec_env") == "gymnasium" and has_vector_env(env_id) else "dummy",
     )
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_tdc import TDC, ResumeStates
-from sb3_tdc.cli import train
+from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs.vector import GymnasiumVecEnv, split_infos
 
 MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED]
@@ -154,6 +154,66 @@ class Tensors(VectorEnv):
         self.t = th.where(over, 0, self.t)
         infos = {"final_obs": last, "_final_obs": over} if over.any() else {}
         return self._observe(), th.ones(self.num_envs), th.zeros(self.num_envs, dtype=th.bool), over, infos
+
+
+class Together(VectorEnv):
+    """As Gymnasium's own on JAX: a seed is one number, all reset or none, and they reset in the step after the end."""
+
+    render_mode = None
+
+    def __init__(self, num_envs=3):
+        self.num_envs, self.seeds, self.over = num_envs, [], False
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+        self.episode = self.t = 0
+
+    def _begin(self):
+        self.t, self.episode = 0, self.episode + 1
+
+    def _observe(self):
+        return np.float32([[self.episode, self.t]] * self.num_envs)
+
+    def reset(self, *, seed=None, options=None):
+        assert seed is None or type(seed) is int
+        self.seeds.append(seed)
+        self._begin()
+        return self._observe(), {}
+
+    def step(self, actions):
+        self.t += 1
+        if self.over:
+            self._begin()
+        self.over = self.t == 4
+        false, over = np.zeros(self.num_envs, bool), np.full(self.num_envs, self.over)
+        return self._observe(), np.full(self.num_envs, float(self.t)), false, over, {}
+
+
+def test_environments_that_take_one_seed_and_reset_together():
+    env = GymnasiumVecEnv(Together())
+    env.seed(7)
+    seen = [env.reset()[1].tolist()]
+    for _ in range(9):
+        observations, rewards, dones, infos = env.step(np.zeros((3, 1), np.float32))
+        assert rewards[0] > 0  # that of the step that resets is none
+        seen.append(observations[1].tolist())
+        assert dones[0] == (seen[-1][1] == 0)
+        if dones[0]:
+            assert infos[2]["terminal_observation"].tolist() == [seen[-2][0], 4]
+    assert env.env.seeds == [7]
+    assert seen == [[1, t] for t in range(4)] + [[2, t] for t in range(4)] + [[3, t] for t in range(2)]
+
+
+def test_a_run_in_a_vector_environment_is_played_in_one(tmp_path, capsys):
+    """There is no other."""
+    gym.register("Together-v0", vector_entry_point="tests.envs.test_vector:Together")
+    options = ["--eval-freq", "150", "--eval-episodes", "1", "--device", "cpu", "-f", str(tmp_path), "-n", "200"]
+    argv = ["--env", "Together-v0", *options, "-params", *SMALL]
+    assert train.main([*argv, "--vec-env", "gymnasium"]) == 0
+    assert enjoy.main([str(tmp_path / "tdc" / "Together-v0_1"), "--n-episodes", "2"]) == 0
+    assert "Return: 10.00 ± 0.00" in capsys.readouterr().out  # 1 + 2 + 3 + 4
+    with pytest.raises(SystemExit):
+        train.main(argv)
+    assert "Together-v0 is a vector environment: add --vec-env gymnasium" in capsys.readouterr().err
 
 
 def test_tensors_become_arrays():
