@@ -2,6 +2,7 @@
 
 import argparse
 from contextlib import closing
+from dataclasses import replace
 from typing import Any
 
 from sb3_tdc.algorithms import ALGORITHMS
@@ -10,6 +11,7 @@ from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job, count_cores
 from sb3_tdc.experiments.search_space import LAMBDAS, make_candidates, parse_space
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
+from sb3_tdc.runs.models import make_model
 
 
 def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
@@ -64,6 +66,7 @@ def check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
     hyperparams = parse(entry, ALGORITHMS[algo], where, settings, "--search and -params")
     try:
         with closing(make_envs(env_id, hyperparams, seed=1, n_envs=hyperparams.n_envs)) as env:
-            ALGORITHMS[algo](env=env, device="cpu", **{**hyperparams.model, "buffer_size": 1_000})
+            small = replace(hyperparams, model={**hyperparams.model, "buffer_size": 1_000})
+            make_model(algo, small, env, device="cpu")
     except SETUP_ERRORS as error:
         raise ValueError(f"--search and -params: {' '.join(str(error).split())}") from error

@@ -1,9 +1,12 @@
 """A run's model: built, loaded with what was saved next to it, or saved with the statistics of its environments."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -27,8 +30,24 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
 
     :param algo: a key of ``ALGORITHMS``
     :param kwargs: further arguments of the algorithm's constructor
+    :raises ValueError: if the policy is for other observations, or the memory is too small
     """
-    return ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
+    space = env.observation_space
+    if hyperparams.model["policy"] == "MultiInputPolicy" and not isinstance(space, spaces.Dict):
+        raise ValueError(
+            f"policy MultiInputPolicy is for Dict observations, got {space}: policy:MlpPolicy or CnnPolicy"
+        )
+    with _enough_memory(hyperparams):
+        return ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
+
+
+@contextmanager
+def _enough_memory(hyperparams: Hyperparams) -> Iterator[None]:
+    try:
+        yield
+    except MemoryError as error:
+        size = hyperparams.model.get("buffer_size", "that of the algorithm")
+        raise ValueError(f"The memory is too small for the replay buffer (buffer_size {size}): {error}") from error
 
 
 def continue_model(
@@ -42,7 +61,8 @@ def continue_model(
     """
     of_the_saved_model = ("policy", "policy_kwargs")
     arguments = {name: value for name, value in hyperparams.model.items() if name not in of_the_saved_model}
-    return load_model(path, algo, env, trust, **arguments, **_action_noise(hyperparams, env), **kwargs)
+    with _enough_memory(hyperparams):
+        return load_model(path, algo, env, trust, **arguments, **_action_noise(hyperparams, env), **kwargs)
 
 
 def load_experience(model: OffPolicyAlgorithm, path: Path, trust: bool) -> None:

@@ -362,18 +362,24 @@ def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
         (["--gym-packages", "no_such_package"], "there is no module 'no_such_package': pip install no_such_package"),
         (["--env", "CartPole-v1"], "env must have a Box action space"),
         (["--env-kwargs", "colour:red"], "colour"),
-        (["--device", "gpu"], "gpu"),
+        (["--device", "gpu"], "--device must be one of auto, cpu"),
+        (
+            ["-params", "policy:MultiInputPolicy"],
+            "policy MultiInputPolicy is for Dict observations, got Box(-inf, inf, ",
+        ),
+        (["-params", f"buffer_size:{10**14}"], f"too small for the replay buffer (buffer_size {10**14}): Unable to "),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_bad_command_lines_get_one_sentence(tmp_path, capsys, args, message):
     with pytest.raises(SystemExit) as exit_:
-        run_train(tmp_path, *args, small=[])
+        run_train(tmp_path / "my" / "logs", *args, small=[])
     assert exit_.value.code == 2
-    error = capsys.readouterr().err
+    out, error = capsys.readouterr()
     assert message in error
     assert "Traceback" not in error
-    assert not list(tmp_path.glob("*/*"))  # no folder of a run that never began
+    assert "Training" not in out
+    assert not list(tmp_path.iterdir())  # no folder of a run that never began
 
 
 def test_a_missing_package_gets_its_command(tmp_path, capsys, monkeypatch):
