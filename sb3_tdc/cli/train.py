@@ -84,9 +84,6 @@ def _main(argv: Sequence[str] | None) -> int:
     settings, folder = run.settings, run.folder
     if settings.progress is None:
         settings.progress = sys.stderr.isatty() and _has_tqdm(settings.verbose)
-    if settings.verbose > 0:
-        verb = "Resuming" if run.is_resumed else "Training"
-        print(f"{verb} {settings.algo} on {settings.env}, seed {settings.seed}, in {folder.path}", flush=True)
     try:
         outcome = train(run)
     except (SetupError, NotRestoredError) as error:

@@ -55,12 +55,11 @@ def check_can_be_made(flag: str, folder: Path) -> None:
 
 def make_numbered(parent: Path, name: str, suffix: str = "") -> Path:
     """Make the folder ``<name>_<next number>``; two processes that start at once get one each."""
-    parent.mkdir(parents=True, exist_ok=True)
     number = max(numbered(parent, name), default=0) + 1
     while True:
         path = parent / f"{name}_{number}{suffix}"
         try:
-            path.mkdir()
+            path.mkdir(parents=True)
         except FileExistsError:
             number += 1
         else:

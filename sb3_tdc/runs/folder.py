@@ -3,12 +3,13 @@
 import json
 import re
 import shlex
+import shutil
 import sys
 import uuid
 import zipfile
 import zlib
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,12 @@ class RunFolder:
 
     :param path: ``<log folder>/<algo>/<environment>_<number>``
     :param env_name: the environment's id, without slashes
+    :param outermost: of the folders that were made for it; None if it was there already
     """
 
     path: Path
     env_name: str
+    outermost: Path | None = field(default=None, compare=False)
 
     @classmethod
     def create(cls, log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> "RunFolder":
@@ -43,9 +46,18 @@ class RunFolder:
         :param unique: append a UUID to the name
         """
         env_name, parent = folder_name(env_id), Path(log_folder) / algo
+        missing = [each for each in (parent, *parent.parents) if not each.exists()]
         path = make_numbered(parent, env_name, f"_{uuid.uuid4()}" if unique else "")
         (path / env_name).mkdir()
-        return cls(path, env_name)
+        return cls(path, env_name, outermost=missing[-1] if missing else path)
+
+    def remove(self) -> None:
+        """Remove the folder of a run that never began, and those that were made for it, unless others use them."""
+        shutil.rmtree(self.path)
+        made = (each for each in self.path.parents if self.outermost and each.is_relative_to(self.outermost))
+        with suppress(OSError):  # one that is not empty
+            for parent in made:
+                parent.rmdir()
 
     @classmethod
     def find(cls, log_folder: str | Path, algo: str, env_id: str, number: int = 0) -> "RunFolder":

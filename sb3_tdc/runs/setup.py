@@ -2,6 +2,7 @@
 
 import shutil
 import textwrap
+from contextlib import suppress
 from dataclasses import fields
 from os.path import abspath
 from pathlib import Path
@@ -88,7 +89,8 @@ def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
             shutil.copyfile(settings.trained_agent, folder.trained_agent)
     except OSError as error:
         if folder is not None:
-            shutil.rmtree(folder.path, ignore_errors=True)
+            with suppress(OSError):
+                folder.remove()
         raise ValueError(f"No run folder can be made in {settings.log_folder}: {error}") from error
     return folder
 

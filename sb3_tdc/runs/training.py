@@ -1,6 +1,5 @@
 """One run, from its settings to its saved model. Called by the command line, by the matrix and by tests."""
 
-import shutil
 import sys
 import traceback
 from collections.abc import Iterator
@@ -138,6 +137,8 @@ def train(run: TrainingRun) -> TrainingOutcome:
             callbacks = _make_callbacks(run, model, stop, states, stack)
             if states is not None:
                 _select_state(run, states, model)
+        if run.settings.verbose > 0:
+            _announce(run)
         with stop, divergence_named(model):
             _learn(run, model, callbacks)
             _save(run, model)
@@ -156,10 +157,15 @@ def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
     except BaseException as error:
         stack.close()
         if not run.is_resumed:
-            shutil.rmtree(run.folder.path)
+            run.folder.remove()
         if not isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt)):
             raise
         raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
+
+
+def _announce(run: TrainingRun) -> None:
+    verb, settings = "Resuming" if run.is_resumed else "Training", run.settings
+    print(f"{verb} {settings.algo} on {settings.env}, seed {settings.seed}, in {run.folder.path}", flush=True)
 
 
 def _learn(run: TrainingRun, model: OffPolicyAlgorithm, callbacks: list[BaseCallback]) -> None:
@@ -177,7 +183,7 @@ def _learn(run: TrainingRun, model: OffPolicyAlgorithm, callbacks: list[BaseCall
         else:
             reason, details = describe_exception(error), ""
         if model.num_timesteps == 0 and not run.is_resumed:
-            shutil.rmtree(run.folder.path)
+            run.folder.remove()
             raise SetupError(f"{run.settings.env} failed before the first step: {reason}") from error
         run.folder.write_error(details or traceback.format_exc())
         raise TrainingError(f"Training failed at step {model.num_timesteps:,}: {reason}") from error
