@@ -138,7 +138,7 @@ def train(run: TrainingRun) -> TrainingOutcome:
             if states is not None:
                 _select_state(run, states, model)
         if run.settings.verbose > 0:
-            _announce(run)
+            _announce(run, model)
         with stop, divergence_named(model):
             _learn(run, model, callbacks)
             _save(run, model)
@@ -163,9 +163,16 @@ def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
         raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
 
 
-def _announce(run: TrainingRun) -> None:
-    verb, settings = "Resuming" if run.is_resumed else "Training", run.settings
+def _announce(run: TrainingRun, model: OffPolicyAlgorithm) -> None:
+    settings, n_timesteps = run.settings, run.hyperparams.n_timesteps
+    verb = "Resuming" if run.is_resumed else "Training"
     print(f"{verb} {settings.algo} on {settings.env}, seed {settings.seed}, in {run.folder.path}", flush=True)
+    if model.learning_starts >= n_timesteps:
+        print(
+            f"Warning: nothing will be learned, as learning_starts, {model.learning_starts:,}, is not below the "
+            f"{n_timesteps:,} steps of this run: add -params learning_starts:…, or more steps by -n",
+            file=sys.stderr,
+        )
 
 
 def _learn(run: TrainingRun, model: OffPolicyAlgorithm, callbacks: list[BaseCallback]) -> None:

@@ -196,6 +196,14 @@ def test_a_log_of_nothing(tmp_path):
     assert run_train(tmp_path, "--log-interval", 0) == 0
 
 
+@pytest.mark.parametrize(("learning_starts", "n_updates"), [(120, 0), (119, 1)])
+def test_a_run_that_learns_nothing_says_so(tmp_path, learning_starts, n_updates, capsys):
+    assert run_train(tmp_path, n=120, small=[*SMALL, f"learning_starts:{learning_starts}"]) == 0
+    assert TDC.load(tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip")._n_updates == n_updates
+    warned = "Warning: nothing will be learned, as learning_starts, 120, is not below the 120 steps of this run"
+    assert (warned in capsys.readouterr().err) == (n_updates == 0)
+
+
 def test_enjoy_finds_models(tmp_path, capsys):
     run_train(tmp_path, "--save-freq", 100)
     folder = tmp_path / "tdc" / "Hopper-v4_1"
