@@ -12,6 +12,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_tdc.common.output import counted
 from sb3_tdc.common.saved_fields import boolean, integer, number
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES
@@ -54,10 +55,15 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
     with reading(f"{path} was not opened"):
         saved = _read_object(path, type(buffer), _arrays_like(buffer))
         if saved["n_envs"] != buffer.n_envs:
-            raise UnsafeFileError(f"it is of {saved['n_envs']} environments, this run has {buffer.n_envs}")
+            raise UnsafeFileError(f"it is of {counted(saved['n_envs'], 'environment')}, this run has {buffer.n_envs}")
+        rows = np.shape(saved["rewards"])[:1]
+        if rows not in ((), (buffer.buffer_size,)):
+            sizes = [n * buffer.n_envs for n in (*rows, buffer.buffer_size)]
+            raise UnsafeFileError(f"its buffer_size is {sizes[0]}, and that of this run is {sizes[1]}")
         for name, fresh in vars(buffer).items():
             if name in saved and not _same_layout(saved[name], fresh):
-                raise UnsafeFileError(f"its {name} are not those of this run (buffer_size, observations, actions)")
+                layouts = f"{_layout(saved[name])}, not {_layout(fresh)}"
+                raise UnsafeFileError(f"its {name} are not those of this run: {layouts}")
         if not 0 <= saved["pos"] < buffer.buffer_size:
             raise UnsafeFileError(f"its position, {saved['pos']}, is outside")
         if isinstance(buffer, HerReplayBuffer):
@@ -126,6 +132,12 @@ def _same_layout(saved: Any, fresh: Any) -> bool:
     if isinstance(fresh, np.ndarray):
         return isinstance(saved, np.ndarray) and saved.shape == fresh.shape and _same_type(saved.dtype, fresh.dtype)
     return type(saved) is type(fresh)
+
+
+def _layout(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_layout(part)}" for key, part in value.items())
+    return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 
 def _same_type(saved: np.dtype, fresh: np.dtype) -> bool:

@@ -146,7 +146,12 @@ def test_going_on_from_a_saved_model(tmp_path, capsys):
 
     for arguments, small, message in (
         (["-i", first / "Hopper-v4.zip"], SMALL, "was trained on normalised observations: add -params normalize:true"),
-        (["-i", first / "Hopper-v4.zip"], [*normalized, "n_envs:2"], "is of 1 environments, this run has 2"),
+        (["-i", first / "Hopper-v4.zip"], [*normalized, "n_envs:2"], "it is of 1 environment, this run has 2"),
+        (
+            ["-i", first / "Hopper-v4.zip"],
+            [*normalized, "buffer_size:5000"],
+            "replay_buffer.pkl was not opened: its buffer_size is 1000000, and that of this run is 5000",
+        ),
         (["-i", first / "Hopper-v4.zip", "--algo", "sac"], SMALL_ANY, "was saved by tdc, not by sac: --algo tdc"),
     ):
         with pytest.raises(SystemExit):

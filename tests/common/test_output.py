@@ -11,11 +11,16 @@ from pathlib import Path
 import pytest
 
 from sb3_tdc import TDC
-from sb3_tdc.common.output import harmless_output
+from sb3_tdc.common.output import counted, harmless_output
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = "--eval-freq 100 --eval-episodes 1 --seed 1 -params learning_starts:50 buffer_size:1000"
 OPTIONS = ["--env", "Pendulum-v1", *SETTINGS.split()]
+
+
+def test_one_is_no_plural():
+    texts = [counted(n, "environment") for n in (0, 1, 2, 1000)]
+    assert texts == ["0 environments", "1 environment", "2 environments", "1,000 environments"]
 
 
 class Broken(io.StringIO):

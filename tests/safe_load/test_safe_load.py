@@ -578,7 +578,7 @@ def test_a_replay_buffer_is_that_of_sb3(tmp_path, marker, name):
     small = MODELS[name]()
     small.buffer_size, small.replay_buffer = 100, None
     small._setup_model()
-    with pytest.raises(UnsafeFileError, match="are not those of this run"):
+    with pytest.raises(UnsafeFileError, match=rf"its buffer_size is {model.buffer_size}, and that of this run is 100$"):
         load_replay_buffer(path, small)
     for attribute in ("observations", "pos", "rewards"):
         poisoned = MODELS[name]()
@@ -606,7 +606,9 @@ def test_observations_of_the_fused_update_load_into_a_fresh_model(tmp_path):
         other = TDC("MlpPolicy", "Hopper-v4", policy_kwargs={"net_arch": [8, 8]}, **TINY)
         other.replay_buffer.rewards = other.replay_buffer.rewards.astype(dtype)
         other.save_replay_buffer(tmp_path / "other.pkl")
-        with pytest.raises(UnsafeFileError, match="rewards are not those of this run"):
+        with pytest.raises(
+            UnsafeFileError, match=f"rewards are not those of this run: {np.dtype(dtype)} .*, not float32"
+        ):
             load_replay_buffer(tmp_path / "other.pkl", fresh)
 
 

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
+from sb3_tdc.common.output import counted
+
 # Without evaluations, a line so often
 _SECONDS_BETWEEN_LINES = 300.0
 _SECONDS_BETWEEN_BAR_UPDATES = 0.1
@@ -77,7 +79,7 @@ class ProgressCallback(BaseCallback):
         if self.bar is not None:
             self.bar.set_postfix_str(f"eval {text}, best {evaluation.best_mean_reward:.1f}")
         elif self.verbose > 0:
-            self.show_line(f"eval {text} ({len(returns)} episodes), best {evaluation.best_mean_reward:.1f}")
+            self.show_line(f"eval {text} ({counted(len(returns), 'episode')}), best {evaluation.best_mean_reward:.1f}")
 
     def show_line(self, text: str = "") -> None:
         """Print one line, for a log file."""
