@@ -82,6 +82,19 @@ def check_within(limits: Limits, name: str, value: Any, shown_as: str = "") -> f
     return check_number(shown_as or name, value, minimum, maximum)
 
 
+def check_boolean(name: str, value: Any, or_none: bool = False) -> bool | None:
+    """
+    Check a truth value: a text would count as true, whatever it says.
+
+    :param or_none: whether None is allowed too, and returned
+    :return: the value, True or False
+    :raises ValueError: if it is anything else
+    """
+    if isinstance(value, (bool, np.bool_)) or (or_none and value is None):
+        return None if value is None else bool(value)
+    raise ValueError(f"{name} must be True{', False or None' if or_none else ' or False'}, got {value!r}")
+
+
 def find_non_finite(network: nn.Module, weights: dict[str, Any]) -> list[str]:
     """
     Look at parameters and running statistics; a constant, for instance the mask of an attention, may be infinite.

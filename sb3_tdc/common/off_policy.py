@@ -13,7 +13,14 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_number, check_within, find_non_finite
+from sb3_tdc.common.checks import (
+    OFF_POLICY_LIMITS,
+    Limits,
+    check_boolean,
+    check_number,
+    check_within,
+    find_non_finite,
+)
 from sb3_tdc.common.diagnostics import Diagnostics, NonFiniteError
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
@@ -44,6 +51,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         self._check_limits("tau", "gamma", "buffer_size", "batch_size", "n_steps", "learning_starts", "gradient_steps")
+        self.optimize_memory_usage = bool(check_boolean("optimize_memory_usage", self.optimize_memory_usage))
         for name in self.schedules:
             value = self.scheduled(name, progress_remaining=1.0)
             given = getattr(self, name)

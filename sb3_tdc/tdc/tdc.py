@@ -19,7 +19,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
 
-from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
+from sb3_tdc.common.checks import (
+    OFF_POLICY_LIMITS,
+    Limits,
+    check_action_space,
+    check_boolean,
+    check_number,
+    check_within,
+)
 from sb3_tdc.common.dormant import dormant_share, relu_activations
 from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.common.noise import noise_of_all
@@ -253,6 +260,8 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
+        self.stochastic_actor = bool(check_boolean("stochastic_actor", self.stochastic_actor))
+        self.fused = check_boolean("fused", self.fused, or_none=True)
         self._check_limits("kappa", "target_policy_noise", "target_noise_clip", "policy_delay")
         if isinstance(self.lam, str):
             initial_lam(self.lam)
