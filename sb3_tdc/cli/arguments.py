@@ -51,9 +51,13 @@ class Parser(argparse.ArgumentParser):
         parsed = self.parse_args(args, argparse.Namespace(**dict.fromkeys(names, absent)))
         return {name: value for name, value in vars(parsed).items() if value is not absent}
 
+    def error(self, message: str) -> NoReturn:
+        """Print one sentence and leave with status 2, without the usage, which fills a screen."""
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
     def fail(self, error: Exception) -> NoReturn:
-        """Print one sentence and leave with status 2, as for a bad argument."""
-        self.exit(2, f"{self.prog}: error: {error}\n")
+        """Leave as for a bad argument."""
+        self.error(str(error))
 
 
 class KeyValues(argparse.Action):

@@ -390,7 +390,8 @@ def test_bad_command_lines_get_one_sentence(tmp_path, capsys, args, message):
     assert exit_.value.code == 2
     out, error = capsys.readouterr()
     assert message in error
-    assert "Traceback" not in error
+    assert error.startswith("sb3-tdc train: error: ")
+    assert error.count("\n") == 1
     assert "Training" not in out
     assert not list(tmp_path.iterdir())  # no folder of a run that never began
 
