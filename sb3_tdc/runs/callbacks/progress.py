@@ -1,5 +1,7 @@
 """How far a run is: a bar on a terminal, rare plain lines elsewhere."""
 
+import os
+import sys
 import time
 from datetime import timedelta
 from typing import Any
@@ -12,6 +14,7 @@ from sb3_tdc.common.output import counted
 # Without evaluations, a line so often
 _SECONDS_BETWEEN_LINES = 300.0
 _SECONDS_BETWEEN_BAR_UPDATES = 0.1
+_DEFAULT_SIZE = {"ncols": 80, "nrows": 24}  # of a terminal that says 0, as a container's may
 
 
 class ProgressCallback(BaseCallback):
@@ -37,12 +40,13 @@ class ProgressCallback(BaseCallback):
         self.first_timestep = self.num_timesteps
         self.total_timesteps = self.locals["total_timesteps"]
         if self.tqdm is not None:
+            size = {"dynamic_ncols": True} if _terminal_has_size() else _DEFAULT_SIZE
             self.bar = self.tqdm(
                 total=self.total_timesteps,
                 initial=self.num_timesteps,
                 unit=" steps",
                 unit_scale=True,
-                dynamic_ncols=True,
+                **size,
             )
 
     def _on_step(self) -> bool:
@@ -105,6 +109,14 @@ class _Evaluation(BaseCallback):
     def _on_step(self) -> bool:
         assert isinstance(self.parent, EvalCallback)
         self.progress.show_evaluation(self.parent)
+        return True
+
+
+def _terminal_has_size() -> bool:
+    """Return whether standard error knows its size, if it is a terminal."""
+    try:
+        return 0 not in os.get_terminal_size(sys.stderr.fileno())
+    except (OSError, ValueError, AttributeError):  # no terminal: a file, a pipe, a notebook
         return True
 
 
