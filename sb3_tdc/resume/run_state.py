@@ -6,6 +6,7 @@ import random
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
+from stable_baselines3.common.logger import HumanOutputFormat
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
@@ -107,7 +109,11 @@ def _restore_values(
     for node, value, path in ((parts["env"], model.env, "env"), (parts["callbacks"], callback, "callbacks")):
         if node is not None:
             context.restore(node, value, path)
-    context.restore_attributes(parts["logger"], getattr(model, "_logger", None), "logger", optional=True)
+    logger = SimpleNamespace(**_logger_attributes(model))
+    context.restore_attributes(parts["logger"], logger, "logger", optional=True)
+    for name, value in vars(logger).items():
+        if name != "output_formats":
+            setattr(model._logger, name, value)
 
 
 def restoring(
@@ -151,8 +157,13 @@ def _attributes(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def _logger_attributes(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    logger = getattr(model, "_logger", None)  # there is none before learn()
-    return {name: value for name, value in vars(logger).items() if name not in ("dir", "level")} if logger else {}
+    logger = getattr(model, "_logger", None)
+    if logger is None:  # before learn()
+        return {}
+    attributes = {name: value for name, value in vars(logger).items() if name not in ("dir", "level")}
+    # What is on a screen stays there, and a resumed run may have another screen, or none
+    files = [each for each in logger.output_formats if not (isinstance(each, HumanOutputFormat) and not each.own_file)]
+    return {**attributes, "output_formats": files}
 
 
 def _buffer(model: OffPolicyAlgorithm) -> Any:

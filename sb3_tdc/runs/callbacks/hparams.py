@@ -3,7 +3,7 @@
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import HParam
+from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 
 
 class RecordHyperparams(BaseCallback):
@@ -20,8 +20,9 @@ class RecordHyperparams(BaseCallback):
 
     def _on_training_start(self) -> None:
         metrics: dict[str, float] = {"eval/mean_reward": 0.0, "rollout/ep_rew_mean": 0.0}
-        self.logger.record("hparams", HParam(self.hparams, metrics), exclude=("stdout", "log", "json", "csv"))
-        self.logger.dump(self.num_timesteps)
+        for output in self.logger.output_formats:  # alone: on a screen SB3 warns of an empty table
+            if isinstance(output, TensorBoardOutputFormat):
+                output.write({"hparams": HParam(self.hparams, metrics)}, {"hparams": ()}, self.num_timesteps)
 
     def _on_step(self) -> bool:
         return True

@@ -1,0 +1,54 @@
+"""What a run shows, and what it says of what it cannot restore."""
+
+import warnings
+
+import pytest
+
+from sb3_tdc import TDC, ResumeStates
+from sb3_tdc.cli import train
+from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+
+OPTIONS = ["--env", "Pendulum-v1", "-n", "120", "--eval-freq", "40", "--eval-episodes", "1", "--seed", "1"]
+SMALL = ["-params", "policy_kwargs:{net_arch: [8]}", "learning_starts:20", "batch_size:16", "buffer_size:1000"]
+
+
+def train_in(folder, *args):
+    return train.main([*OPTIONS, "--device", "cpu", "-f", str(folder), *map(str, args), *SMALL])
+
+
+def stop_at(monkeypatch, call):
+    def _on_step(self):
+        self.requested = self.n_calls == call
+        return not self.requested
+
+    monkeypatch.setattr(StopOnSignal, "_on_step", _on_step)
+
+
+def rows(folder):
+    lines = (folder / "tdc" / "Pendulum-v1_1" / "progress.csv").read_text().splitlines()
+    header, *rows = [line.split(",") for line in lines]
+    return [{name: value for name, value in zip(header, row, strict=True) if "time/" not in name} for row in rows]
+
+
+@pytest.mark.parametrize(("first", "second"), [(1, 2), (2, 1), (2, 2)])
+def test_tables_on_the_screen_are_no_part_of_the_state(tmp_path, monkeypatch, capsys, first, second):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.filterwarnings("error", "Tried to write empty key-value dict")
+        assert train_in(tmp_path / "whole") == 0
+        with monkeypatch.context() as patch:
+            stop_at(patch, 60)
+            assert train_in(tmp_path / "stopped", "--verbose", first) == 130
+        capsys.readouterr()
+        run = tmp_path / "stopped" / "tdc" / "Pendulum-v1_1"
+        assert train.main(["--resume", str(run), "--verbose", str(second)]) == 0
+    assert rows(tmp_path / "stopped") == rows(tmp_path / "whole")
+    assert ("|    mean_reward " in capsys.readouterr().out) == (second == 2)
+
+
+def test_the_tables_of_sb3_need_no_warning(tmp_path):
+    """As with ``verbose=1``."""
+    model = TDC("MlpPolicy", "Pendulum-v1", verbose=1, buffer_size=100, policy_kwargs={"net_arch": [8]}, device="cpu")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        model.learn(20, callback=ResumeStates(tmp_path, freq=10))
