@@ -10,7 +10,7 @@ from pathlib import Path
 from sb3_tdc.cli.arguments import Parser, add_settings
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.diagnostics import NonFiniteError
-from sb3_tdc.common.output import harmless_output
+from sb3_tdc.common.output import harmless_output, warnings_as_sentences
 from sb3_tdc.resume import LockedError, NotRestoredError, stored_steps
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import RunSettings
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, 1 if training diverged or its model could not be saved, 130 if the user stopped it
     """
-    with harmless_output():
+    with harmless_output(), warnings_as_sentences():
         return _main(argv)
 
 

@@ -2,9 +2,13 @@
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
+
+_PACKAGE = Path(__file__).parents[1]
 
 
 def counted(n: int, noun: str) -> str:
@@ -38,6 +42,23 @@ class _HarmlessStream:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+@contextmanager
+def warnings_as_sentences() -> Iterator[None]:
+    """Print the warnings of this package without the file, the line and the code that they come from."""
+    usual: Any = warnings.formatwarning
+
+    def format_warning(message: Any, category: type[Warning], filename: str, lineno: int, line: Any = None) -> str:
+        if Path(filename).is_relative_to(_PACKAGE):
+            return f"Warning: {message}\n"
+        return usual(message, category, filename, lineno, line)
+
+    warnings.formatwarning = format_warning
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import shutil
 import time
 import warnings
@@ -25,6 +26,8 @@ from sb3_tdc.resume.store import Store, Stored
 from sb3_tdc.resume.walk import Initial, NotRestoredError
 
 DEFAULT_FREQ = 10_000
+# How a sentence begins that is about one of several environments
+_ENVIRONMENT = re.compile(r".*?, environment \d+(?=: )")
 # The older state that stays is between this and twice this many times ``freq`` steps older than the newest
 _OLDER = 10
 
@@ -149,7 +152,8 @@ class ResumeStates(BaseCallback):
         context = run_state.restoring(model, numbered, stored.step, locations)
         run_state.restore_state(model, self.root, parts["state"], context, self._changed)
         restarted = [why for why in context.restarted if why.startswith("env")]
-        for why in (*context.not_restored, *(why for why in context.restarted if why not in restarted)):
+        others = [why for why in (*context.not_restored, *context.restarted) if why not in restarted]
+        for why in _without_repetition(why for why in others if why not in self._told):
             warnings.warn(f"Not restored: {why}", RuntimeWarning, stacklevel=2)
         self._put_files_back(stored, parts["files"])
         self.store.remove_after(stored.step)
@@ -196,9 +200,8 @@ class ResumeStates(BaseCallback):
         self._tell(names)
 
     def _tell(self, names: list[str]) -> None:
-        for name in dict.fromkeys(names):
-            if name not in self._told:
-                warnings.warn(f"Not in the resume states: {name}", RuntimeWarning, stacklevel=2)
+        for name in _without_repetition(name for name in names if name not in self._told):
+            warnings.warn(f"Not in the resume states: {name}", RuntimeWarning, stacklevel=2)
         self._told.update(names)
 
     def _on_rollout_start(self) -> None:
@@ -314,6 +317,19 @@ class ResumeStates(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+def _without_repetition(sentences: Iterable[str]) -> list[str]:
+    """Return sentences about what is left out, and one for all environments of which the same is said."""
+    places: dict[str, list[str]] = {}
+    for sentence in dict.fromkeys(sentences):
+        environment = _ENVIRONMENT.match(sentence)
+        place = environment[0] if environment else ""
+        places.setdefault(sentence.removeprefix(place), []).append(place)
+    return [
+        f"{place} (and {counted(len(others), 'other')}){what}" if others else f"{place}{what}"
+        for what, (place, *others) in places.items()
+    ]
 
 
 def _refuse_non_finite(step: int, names: list[str]) -> None:

@@ -144,7 +144,7 @@ def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
 
 
 def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str) -> None:
-    context.left_out += state["left_out"]
+    context.left_out += [f"{path}: {why}" for why in state["left_out"]]
     context.texts |= {f"{path}: {name}": text for name, text in state["texts"].items()}
     context.shared_elsewhere |= {f"{path}: {group}": f"{path}: {paths}" for group, paths in state["shared"].items()}
     if state["why"] is not None:

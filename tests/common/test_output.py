@@ -6,16 +6,28 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import sb3_tdc
 from sb3_tdc import TDC
-from sb3_tdc.common.output import counted, harmless_output
+from sb3_tdc.common.output import counted, harmless_output, warnings_as_sentences
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = "--eval-freq 100 --eval-episodes 1 --seed 1 -params learning_starts:50 buffer_size:1000"
 OPTIONS = ["--env", "Pendulum-v1", *SETTINGS.split()]
+
+
+def test_warnings_of_this_package_are_sentences():
+    usual = warnings.formatwarning
+    others = ("It diverges.", RuntimeWarning, np.__file__, 7)
+    with warnings_as_sentences():
+        assert warnings.formatwarning("It ends.", RuntimeWarning, sb3_tdc.__file__, 7) == "Warning: It ends.\n"
+        assert warnings.formatwarning(*others) == usual(*others)
+    assert warnings.formatwarning is usual
 
 
 def test_one_is_no_plural():

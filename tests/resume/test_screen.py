@@ -1,8 +1,11 @@
 """What a run shows, and what it says of what it cannot restore."""
 
+import threading
 import warnings
 
+import gymnasium as gym
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from sb3_tdc import TDC, ResumeStates
 from sb3_tdc.cli import train
@@ -52,3 +55,29 @@ def test_the_tables_of_sb3_need_no_warning(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         model.learn(20, callback=ResumeStates(tmp_path, freq=10))
+
+
+class Locks(PendulumEnv):
+    """Holds what Python cannot see into."""
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode)
+        self.lock = threading.Lock()
+
+
+gym.register("Locks-v0", Locks, max_episode_steps=30)
+
+
+def test_one_cause_is_one_sentence(tmp_path, monkeypatch):
+    """Also where it is in every environment, of training and of evaluation."""
+    cause = "env[1].env.env.env.env.lock is a _thread.lock"
+    left_out = f"Not in the resume states: env, environment 0 (and 3 others): {cause}"
+    with monkeypatch.context() as patch:
+        stop_at(patch, 20)
+        with pytest.warns(RuntimeWarning) as first:
+            train_in(tmp_path, "--env", "Locks-v0", "--resume-freq", "30", "-params", "n_envs:3")
+    assert [str(each.message) for each in first] == [left_out]
+    with pytest.warns(RuntimeWarning) as second:
+        assert train.main(["--resume", str(tmp_path / "tdc" / "Locks-v0_1")]) == 0
+    new_episodes = "Continuing with new episodes, since not all of an environment could be restored: env, environment 0"
+    assert [str(each.message) for each in second] == [left_out, f"{new_episodes}: {cause}"]
