@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 from sb3_tdc.common.files import is_file_at, lock
 
@@ -61,9 +62,13 @@ def stored_steps(folder: Path) -> list[int]:
     return sorted((int(match[1]) for match in found if match), reverse=True)
 
 
+# The open stores of this process, by folder
+_OPEN: "WeakValueDictionary[Path, Store]" = WeakValueDictionary()
+
+
 class Store:
     """
-    The states of one run.
+    The states of one run. In one process, the newest store of a folder has it: an older one finds it locked.
 
     :param folder: made if it is missing
     :param keep: how many of the newest stay
@@ -75,24 +80,28 @@ class Store:
     def __init__(self, folder: Path, keep: int, span: int):
         self.folder, self.keep, self.span = folder, keep, span
         (folder / _SHARED).mkdir(parents=True, exist_ok=True)
+        earlier = _OPEN.get(folder.resolve())
+        if earlier is not None:
+            earlier.close()
         # Outside the folder: removing the states must not let a second process in
         self._lock_file = folder.with_name(f"{folder.name}.lock")
         self._lock = _lock(self._lock_file)
+        _OPEN[folder.resolve()] = self
 
     def close(self) -> None:
-        """Let another process write there."""
+        """Let others write there, until this one writes again."""
         self._lock.close()
 
     def open_again(self, shared: Iterable[str]) -> bool:
         """
-        Make the folder, and take the lock, again if they have been removed.
+        Make the folder, and take the lock, again if they have been removed, or the store has been closed.
 
         :param shared: names of shared files
         :return: whether these are still there
         :raises LockedError: if another process writes there by now
         """
         (self.folder / _SHARED).mkdir(parents=True, exist_ok=True)
-        if not is_file_at(self._lock, self._lock_file):
+        if self._lock.closed or not is_file_at(self._lock, self._lock_file):
             locked = _lock(self._lock_file)
             self._lock.close()
             self._lock = locked
@@ -289,5 +298,5 @@ def _sync_folder(path: Path) -> None:
 def _lock(path: Path) -> Any:
     file = lock(path)
     if file is None:
-        raise LockedError(f"Another process writes resume states to {path.parent}")
+        raise LockedError(f"Another process, or another ResumeStates of this one, writes to {path.parent}")
     return file

@@ -2,11 +2,14 @@
 
 import errno
 import os
+import subprocess
+import sys
 import warnings
 
 import pytest
 
-from sb3_tdc.resume.store import BrokenStateError, Store
+from sb3_tdc.resume.store import BrokenStateError, LockedError, Store
+from tests.helpers.command_line import ROOT
 
 
 @pytest.fixture
@@ -130,10 +133,28 @@ def test_a_full_disk_leaves_no_trace(store, monkeypatch):
 
 
 def test_one_process_at_a_time(store):
-    with pytest.raises(ValueError, match="Another process writes resume states"):
-        Store(store.folder, 2, 0)
+    code = f"from pathlib import Path; from sb3_tdc.resume.store import Store; Store(Path({str(store.folder)!r}), 2, 0)"
+
+    def open_elsewhere():
+        return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+
+    assert f"Another process, or another ResumeStates of this one, writes to {store.folder.parent}" in (
+        open_elsewhere().stderr
+    )
     store.close()
-    Store(store.folder, 2, 0).close()
+    assert open_elsewhere().returncode == 0
+
+
+def test_in_one_process_the_newest_has_the_folder(store):
+    """As when a cell of a notebook is run again: nothing has closed the first."""
+    write(store, 1)
+    second = Store(store.folder, 2, 0)
+    write(second, 2)
+    with pytest.raises(LockedError, match="another ResumeStates of this one"):
+        store.open_again([])
+    second.close()
+    assert store.open_again(["ring_2"])  # the first may go on as soon as the second is done
+    assert store.newest().step == 2
 
 
 def test_there_is_always_an_older_one_to_go_back_to(tmp_path):
