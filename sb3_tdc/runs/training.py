@@ -158,9 +158,12 @@ def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
         stack.close()
         if not run.is_resumed:
             run.folder.remove()
-        if not isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt)):
+        if not isinstance(error, (Exception, KeyboardInterrupt)):
             raise
-        raise SetupError(" ".join(str(error).split()) or "Interrupted before training began") from error
+        # Others are of wrappers, policies and callbacks that the user has written: with their place
+        is_a_sentence = isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt))
+        reason = " ".join(str(error).split()) if is_a_sentence else describe_exception(error)
+        raise SetupError(reason or "Interrupted before training began") from error
 
 
 def _announce(run: TrainingRun, model: OffPolicyAlgorithm) -> None:

@@ -396,6 +396,19 @@ def test_bad_command_lines_get_one_sentence(tmp_path, capsys, args, message):
     assert not list(tmp_path.iterdir())  # no folder of a run that never began
 
 
+@pytest.mark.parametrize("key", ["callback", "vec_env_wrapper"])
+def test_what_the_user_has_written_is_named_with_its_place(tmp_path, key, monkeypatch, capsys):
+    (tmp_path / "my_own.py").write_text("class Part:\n    def __init__(self, *args):\n        self.name.lower()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    sys.modules.pop("my_own", None)
+    with pytest.raises(SystemExit) as exit_:
+        run_train(tmp_path / "logs", "-params", *SMALL[1:], f"{key}:my_own.Part", small=[])
+    assert exit_.value.code == 2
+    reason = f"AttributeError: 'Part' object has no attribute 'name' ({tmp_path / 'my_own.py'}, line 3)"
+    assert capsys.readouterr().err == f"sb3-tdc train: error: {reason}\n"
+    assert not (tmp_path / "logs").exists()
+
+
 def test_a_missing_package_gets_its_command(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
     with pytest.raises(SystemExit):
