@@ -167,7 +167,7 @@ def test_a_folder_that_cannot_be_written_to_is_a_sentence_and_nothing_stays(tmp_
     error = fails(lambda: run_train(tmp_path), capsys)
     assert "No run folder can be made in" in error
     assert "No space left" in error
-    assert list((tmp_path / "tdc").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
 class FailsInEvaluation(PendulumEnv):
@@ -403,4 +403,4 @@ def test_a_process_of_an_environment_that_fails_is_named(tmp_path, how, argument
 def test_an_environment_that_fails_before_the_first_step_leaves_nothing(tmp_path, capsys):
     error = fails(lambda: run_train(tmp_path, "--env-kwargs", "how:reset", env="Raises-v0"), capsys)
     assert "no scene to load" in error
-    assert list((tmp_path / "tdc").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
