@@ -33,7 +33,7 @@ from sb3_tdc.envs.rendering import (
     render_modes,
 )
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.runs.settings import MAX_SEED
+from sb3_tdc.runs.settings import MAX_SEED, RunSettings, check_settings
 from sb3_tdc.runs.trained import TrainedModel, open_run, open_zip
 from sb3_tdc.tdc import TDC
 
@@ -304,8 +304,9 @@ def _choose_who_acts(model: BaseAlgorithm, args: argparse.Namespace) -> Abstract
     return nullcontext() if args.board else model.policy.actor_alone()
 
 
-def _check_numbers(args: argparse.Namespace) -> None:
-    """:raises ValueError: for one that is not allowed"""
+def _check_arguments(args: argparse.Namespace) -> None:
+    """:raises ValueError: for a number that is not allowed, or a device that is not there"""
+    check_settings(RunSettings(num_threads=args.num_threads, device=args.device))
     if not 0 <= args.seed <= MAX_SEED:
         raise ValueError(f"--seed must be 0 to {MAX_SEED}, got {args.seed}")
     if args.n_episodes < 1:
@@ -318,7 +319,7 @@ def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
     args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
     if args.trust:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
-    _check_numbers(args)
+    _check_arguments(args)
     set_threads(args.num_threads)
     trained = find_trained(args, given)
     set_random_seed(args.seed)

@@ -11,11 +11,6 @@ from typing import Any
 _PACKAGE = Path(__file__).parents[1]
 
 
-def counted(n: int, noun: str) -> str:
-    """Return ``"1 step"`` or ``"2 steps"``."""
-    return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
-
-
 class _HarmlessStream:
     """
     A text stream that drops what cannot be written, and replaces letters that it cannot encode.

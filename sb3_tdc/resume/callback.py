@@ -19,7 +19,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from sb3_tdc.common.diagnostics import NonFiniteError
-from sb3_tdc.common.output import counted
+from sb3_tdc.common.words import count
 from sb3_tdc.resume import replay_file, run_state
 from sb3_tdc.resume.locations import Locations
 from sb3_tdc.resume.store import Store, Stored
@@ -305,7 +305,7 @@ class ResumeStates(BaseCallback):
     def _put_files_back(self, stored: Stored, saved: list[str | None]) -> None:
         files = [*self.files, *run_state.files_of_evaluations(self.root)]
         if len(files) != len(saved):
-            of_callbacks = f"{counted(len(saved), 'file')} of callbacks"
+            of_callbacks = f"{count(len(saved), 'file')} of callbacks"
             raise NotRestoredError(f"{stored.path} has {of_callbacks}, this run has {len(files)}")
         for file, number in zip(files, saved, strict=True):
             if number is None:
@@ -327,14 +327,14 @@ def _without_repetition(sentences: Iterable[str]) -> list[str]:
         place = environment[0] if environment else ""
         places.setdefault(sentence.removeprefix(place), []).append(place)
     return [
-        f"{place} (and {counted(len(others), 'other')}){what}" if others else f"{place}{what}"
+        f"{place} (and {count(len(others), 'other')}){what}" if others else f"{place}{what}"
         for what, (place, *others) in places.items()
     ]
 
 
 def _refuse_non_finite(step: int, names: list[str]) -> None:
     if names:
-        more = f" and {counted(len(names) - 3, 'other')}" if len(names) > 3 else ""
+        more = f" and {count(len(names) - 3, 'other')}" if len(names) > 3 else ""
         raise NonFiniteError(
             f"The state of step {step:,} was not written: {', '.join(names[:3])}{more} are not finite. "
             "Training has stopped; those before stay."

@@ -7,7 +7,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_tdc.common.output import counted
+from sb3_tdc.common.words import count
 from sb3_tdc.resume.event_files import capture_event_files, restore_event_files
 from sb3_tdc.resume.kinds.generators import GENERATORS
 from sb3_tdc.resume.locations import Locations
@@ -160,7 +160,7 @@ def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) ->
     env = existing_as((DummyVecEnv, SubprocVecEnv), existing, path)
     captured, attributes = content
     if len(captured) != env.num_envs:
-        raise NotRestoredError(f"{path} had {counted(len(captured), 'environment')}, and has {env.num_envs}")
+        raise NotRestoredError(f"{path} had {count(len(captured), 'environment')}, and has {env.num_envs}")
     states = [{**state, "arrays": [context.array(number) for number in state["arrays"]]} for state in captured]
     built = [context.locations.below(f"{path}, environment {i}: ") for i in range(len(states))]
     arguments = [(state, context.with_files, locations) for state, locations in zip(states, built, strict=True)]

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.files import write_atomically
 from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
-from sb3_tdc.common.output import counted
+from sb3_tdc.common.words import count
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.runs.callbacks.finite_guard import check_weights
 from sb3_tdc.runs.folder import RunFolder
@@ -79,7 +79,7 @@ def load_experience(model: OffPolicyAlgorithm, path: Path, trust: bool) -> None:
     assert model.replay_buffer is not None
     assert model.env is not None
     if model.replay_buffer.n_envs != model.env.num_envs:
-        n_envs = counted(model.replay_buffer.n_envs, "environment")
+        n_envs = count(model.replay_buffer.n_envs, "environment")
         raise ValueError(f"{path} is of {n_envs}, this run has {model.env.num_envs}")
     model.learning_starts = 0  # no random steps on top of the loaded experience
 

@@ -12,8 +12,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_tdc.common.output import counted
 from sb3_tdc.common.saved_fields import boolean, integer, number
+from sb3_tdc.common.words import count
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Rebuild, read_pickle
@@ -55,7 +55,7 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
     with reading(f"{path} was not opened"):
         saved = _read_object(path, type(buffer), _arrays_like(buffer))
         if saved["n_envs"] != buffer.n_envs:
-            raise UnsafeFileError(f"it is of {counted(saved['n_envs'], 'environment')}, this run has {buffer.n_envs}")
+            raise UnsafeFileError(f"it is of {count(saved['n_envs'], 'environment')}, this run has {buffer.n_envs}")
         rows = np.shape(saved["rewards"])[:1]
         if rows not in ((), (buffer.buffer_size,)):
             sizes = [n * buffer.n_envs for n in (*rows, buffer.buffer_size)]

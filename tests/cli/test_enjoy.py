@@ -38,6 +38,8 @@ def refused(capsys, *arguments):
         (["--n-episodes", "-3"], "--n-episodes must be at least 1, got -3"),
         (["-n", "0"], "-n must be at least 1 (or -1: no limit), got 0"),
         (["-n", "-2"], "-n must be at least 1 (or -1: no limit), got -2"),
+        (["--num-threads", "0"], "--num-threads must be at least 1"),
+        (["--device", "gpu"], "--device must be one of auto, cpu"),
         (["--algo", "sac"], "--algo sac contradicts {run}: it was trained with tdc"),
         (["--env", "Hopper-v4"], "--env Hopper-v4 contradicts {run}: it was trained with Pendulum-v1"),
         (["--exp-id", "2"], "--exp-id chooses a model, and so does {run}: leave out one"),

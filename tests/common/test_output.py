@@ -14,7 +14,7 @@ import pytest
 
 import sb3_tdc
 from sb3_tdc import TDC
-from sb3_tdc.common.output import counted, harmless_output, warnings_as_sentences
+from sb3_tdc.common.output import harmless_output, warnings_as_sentences
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = "--eval-freq 100 --eval-episodes 1 --seed 1 -params learning_starts:50 buffer_size:1000"
@@ -28,11 +28,6 @@ def test_warnings_of_this_package_are_sentences():
         assert warnings.formatwarning("It ends.", RuntimeWarning, sb3_tdc.__file__, 7) == "Warning: It ends.\n"
         assert warnings.formatwarning(*others) == usual(*others)
     assert warnings.formatwarning is usual
-
-
-def test_one_is_no_plural():
-    texts = [counted(n, "environment") for n in (0, 1, 2, 1000)]
-    assert texts == ["0 environments", "1 environment", "2 environments", "1,000 environments"]
 
 
 class Broken(io.StringIO):

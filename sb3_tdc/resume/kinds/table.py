@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 import torch as th
 
-from sb3_tdc.common.output import counted
+from sb3_tdc.common.words import count
 from sb3_tdc.resume import environments, mujoco, pybullet
 from sb3_tdc.resume.kinds import arrays, containers, generators, objects
 from sb3_tdc.resume.walk import Kind, Kinds, name_of, plain
@@ -180,7 +180,7 @@ KINDS: Kinds = {
         environments.is_vec_env,
         environments.capture_vec_env,
         environments.restore_vec_env,
-        needs=lambda content: counted(len(content[0]), "environment"),
+        needs=lambda content: count(len(content[0]), "environment"),
     ),
     "event files": Kind(
         environments.is_event_files,

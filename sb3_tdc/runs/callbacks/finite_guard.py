@@ -9,8 +9,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc.common.checks import find_non_finite
-from sb3_tdc.common.output import counted
 from sb3_tdc.common.transitions import check_first_observation, check_transition
+from sb3_tdc.common.words import count
 from sb3_tdc.tdc import NonFiniteError
 
 
@@ -63,4 +63,4 @@ def _non_finite_weights(model: BaseAlgorithm) -> list[str]:
     _, names = model._get_torch_save_params()
     broken = find_non_finite(model.policy, model.policy.state_dict())
     broken += [name for name in names if not th.as_tensor(getattr(model, name)).isfinite().all()]
-    return broken if len(broken) <= 3 else [*broken[:3], f"and {counted(len(broken) - 3, 'other')}"]
+    return broken if len(broken) <= 3 else [*broken[:3], f"and {count(len(broken) - 3, 'other')}"]

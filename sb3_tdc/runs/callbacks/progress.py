@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
-from sb3_tdc.common.output import counted
+from sb3_tdc.common.words import count
 
 # Without evaluations, a line so often
 _SECONDS_BETWEEN_LINES = 300.0
@@ -83,7 +83,7 @@ class ProgressCallback(BaseCallback):
         if self.bar is not None:
             self.bar.set_postfix_str(f"eval {text}, best {evaluation.best_mean_reward:.1f}")
         elif self.verbose > 0:
-            self.show_line(f"eval {text} ({counted(len(returns), 'episode')}), best {evaluation.best_mean_reward:.1f}")
+            self.show_line(f"eval {text} ({count(len(returns), 'episode')}), best {evaluation.best_mean_reward:.1f}")
 
     def show_line(self, text: str = "") -> None:
         """Print one line, for a log file."""

@@ -1,0 +1,12 @@
+"""Numbers and lists in sentences."""
+
+from sb3_tdc.common.words import count, listed
+
+
+def test_one_is_no_plural():
+    texts = [count(n, "environment") for n in (0, 1, 2, 1000)]
+    assert texts == ["0 environments", "1 environment", "2 environments", "1,000 environments"]
+
+
+def test_lists():
+    assert [listed(list("abc"[:n])) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
