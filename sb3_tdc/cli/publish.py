@@ -30,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         runs, unreadable = find_runs(args.logs)
         check_can_be_made("-o", args.output)
-        if args.output.resolve() == args.logs.resolve():
-            raise ValueError(f"-o must be another folder than that of the runs, got {args.output} for both")
+        if args.output.resolve().is_relative_to(args.logs.resolve()):
+            raise ValueError(f"-o must not lie in the folder of the runs, {args.logs}, got {args.output}")
     except ValueError as error:
         parser.fail(error)
     to_publish = [run for run in runs if run.is_finished and run.evaluations is not None]

@@ -15,7 +15,6 @@ from sb3_tdc.experiments import final_episodes as test_returns
 from sb3_tdc.experiments.results import Run
 
 RESULTS = Path("results")
-_FILES = ("evaluations.npz", test_returns.FILE)
 _SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
 # Rows of the log; more show the same curve
 _ROWS = 150
@@ -27,15 +26,16 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     """
     Copy the small files of a finished run; its log thinned, its paths relative to ``logs``.
 
-    What an earlier copy had and the run no longer has is removed: test returns may be those of another model.
+    Test returns are copied if they are those of the model as it is now. What an earlier copy had and the run no longer
+    has is removed.
 
     :return: where they are
     """
     source, place = run.folder, folder / run.folder.path.relative_to(logs)
     target = place / source.env_name
     target.mkdir(parents=True, exist_ok=True)
-    for name in _FILES:
-        _mirror(source.path / name, place / name)
+    _mirror(source.path / "evaluations.npz", place / "evaluations.npz")
+    _mirror(source.path / test_returns.FILE, place / test_returns.FILE, test_returns.read_test_returns(run) is not None)
     for name in _SETTINGS:
         _mirror(source.path / source.env_name / name, target / name)
     relative = str(place.relative_to(folder).parents[1])
@@ -49,9 +49,9 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     return place
 
 
-def _mirror(source: Path, target: Path) -> None:
-    """Copy a file, or remove the copy of one that is no longer there."""
-    if source.is_file():
+def _mirror(source: Path, target: Path, is_valid: bool = True) -> None:
+    """Copy a file, or remove the copy of one that is no longer there, or valid."""
+    if source.is_file() and is_valid:
         shutil.copyfile(source, target)
     else:
         target.unlink(missing_ok=True)
