@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.output import harmless_output
+from sb3_tdc.common.untrusted import escaped
 
 COMMANDS = {
     "train": "train an agent, or resume a run",
@@ -16,7 +17,7 @@ COMMANDS = {
     "tune": "search hyperparameters",
     "matrix": "train the runs of a figure of the paper, several at once",
     "evaluate": "play test episodes with every finished run",
-    "report": "make one page of all runs in a folder",
+    "report": "make one page of all runs in some folders",
     "publish": "copy the small files of finished runs into a folder to commit",
 }
 _USAGE = "usage: sb3-tdc COMMAND [ARGUMENTS], or sb3-tdc COMMAND --help\n\n" + "\n".join(
@@ -46,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         reason = error.strerror or " ".join(str(error).split())
         place = f"{error.filename}: " if error.filename is not None else ""
-        status, sentence = 1, f"{command(name)}: error: {place}{reason}"
+        status, sentence = 1, f"{command(name)}: error: {escaped(f'{place}{reason}')}"
     with harmless_output():
         if sentence:
             print(sentence, file=sys.stderr)

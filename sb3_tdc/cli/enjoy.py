@@ -134,20 +134,20 @@ def find_trained(args: argparse.Namespace, given: Collection[str]) -> TrainedMod
     :raises ValueError: if there is none, or the arguments contradict each other
     """
     if args.run is None:
-        run = find_run(args)
-        return open_run(run, find_model(args, run), args.gym_packages, args.trust)
+        return _open_run(args)
     for name in ("exp_id", "log_folder", *(_CHOICES if args.run.is_file() else ())):
         if name in given:
             raise ValueError(f"--{name.replace('_', '-')} chooses a model, and so does {args.run}: leave out one")
-    if args.run.is_file():
-        trained = _open_file(args, given)
-    else:
-        run = find_run(args)
-        trained = open_run(run, find_model(args, run), args.gym_packages, args.trust)
+    trained = _open_file(args, given) if args.run.is_file() else _open_run(args)
     for name, found in (("algo", trained.algo), ("env", trained.env_id)):
         if name in given and getattr(args, name) != found:
             raise ValueError(f"--{name} {getattr(args, name)} contradicts {args.run}: it was trained with {found}")
     return trained
+
+
+def _open_run(args: argparse.Namespace) -> TrainedModel:
+    run = find_run(args)
+    return open_run(run, find_model(args, run), args.gym_packages, args.trust)
 
 
 def _open_file(args: argparse.Namespace, given: Collection[str]) -> TrainedModel:

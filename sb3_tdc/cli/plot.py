@@ -10,11 +10,10 @@ import numpy as np
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.files import check_writable
-from sb3_tdc.common.plots import import_figure, style_axes
+from sb3_tdc.common.plots import add_legend, import_figure, style_axes
+from sb3_tdc.common.words import counted
 from sb3_tdc.runs.folder import RunFolder
 
-# More labels would cover the curves
-_LABELS_INSIDE = 4
 _LABELS_IN_A_COLUMN = 16
 
 
@@ -64,11 +63,9 @@ def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
         steps = np.repeat(curve.timesteps, curve.returns.shape[1])
         axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
     numbers = sorted({curve.returns.shape[1] for curve in curves})
-    episodes = f"{', '.join(map(str, numbers))} mean-action episode{'' if numbers == [1] else 's'}"
-    style_axes(axes, curves[0].env_id, "environment steps", f"return of {episodes}")
+    style_axes(axes, curves[0].env_id, "environment steps", f"return of {counted(numbers, 'mean-action episode')}")
     axes.xaxis.set_major_formatter("{x:,.0f}")
-    outside = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "ncols": -(-len(curves) // _LABELS_IN_A_COLUMN)}
-    axes.legend(frameon=False, **(outside if len(curves) > _LABELS_INSIDE else {}))
+    add_legend(axes, "outside center right", ncols=-(-len(curves) // _LABELS_IN_A_COLUMN))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+_LINES_INSIDE = 4
+
 
 def import_figure() -> Any:
     """
@@ -14,6 +16,20 @@ def import_figure() -> Any:
     except ImportError as error:
         raise ImportError('Figures need matplotlib: pip install "sb3-tdc[plot]"') from error
     return Figure
+
+
+def add_legend(axes: Any, outside: str, ncols: int) -> None:
+    """
+    Add a legend inside the axes, or next to them where its lines would hide the curves.
+
+    :param outside: matplotlib's location of a legend of the figure, for instance ``"outside lower left"``
+    :param ncols: of columns there
+    """
+    handles, _ = axes.get_legend_handles_labels()
+    if len(handles) <= _LINES_INSIDE:
+        axes.legend(frameon=False, fontsize="small")
+    else:
+        axes.figure.legend(frameon=False, fontsize="small", loc=outside, ncols=ncols)
 
 
 def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:

@@ -8,6 +8,12 @@ def count(n: int, noun: str) -> str:
     return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
 
 
+def counted(numbers: Sequence[int], noun: str) -> str:
+    """``counted([1, 5], "seed")`` → "1 and 5 seeds"; ``numbers`` must not be empty, and rise."""
+    *others, largest = numbers
+    return listed([*map(str, others), count(largest, noun)])
+
+
 def listed(words: Sequence[str]) -> str:
     """``["a", "b", "c"]`` → "a, b and c"."""
     return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else "".join(words)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_tdc.algorithms import ALGORITHMS
-from sb3_tdc.common.plots import style_axes
+from sb3_tdc.common.plots import add_legend, style_axes
 from sb3_tdc.common.words import count
 from sb3_tdc.experiments.published_curves import PublishedCurve
 from sb3_tdc.experiments.statistics import mean_interval
@@ -19,8 +19,6 @@ _OF_SB3 = {"TD3": "#D55E00", "SAC": "#009E73", "DDPG": "#CC79A7"}
 COLORS: dict[str, str] = _OF_SB3 | {
     name.upper(): color for name, algorithm in ALGORITHMS.items() if (color := vars(algorithm).get("color")) is not None
 }
-# A legend of more lines would hide the curves
-_LINES_INSIDE = 4
 OTHER_COLORS = ("#56B4E9", "#000000", "#7F7F7F", "#8C564B", "#9467BD", "#BCBD22")
 
 
@@ -97,7 +95,7 @@ def draw_curves(
     axes.set_ylim(*_limits(values[np.isfinite(values)], log))
     style_axes(axes, title, "environment steps", ylabel)
     axes.xaxis.set_major_formatter(_short_number)
-    _add_legend(axes)
+    add_legend(axes, "outside lower left", ncols=2)
 
 
 def draw_box_plots(
@@ -169,15 +167,6 @@ def draw_intervals(
     style_axes(axes, title, xlabel, "")
     axes.set_yticks(range(len(labels)), ["\n".join(wrap(line, 22) for line in label.split("\n")) for label in labels])
     axes.set_ylim(len(labels) - 0.5, -0.5)
-
-
-def _add_legend(axes: Any) -> None:
-    """Inside the axes where few lines leave room, else below them."""
-    lines = len(axes.get_legend_handles_labels()[0])
-    if lines <= _LINES_INSIDE:
-        axes.legend(frameon=False, fontsize="small")
-    else:
-        axes.figure.legend(frameon=False, fontsize="x-small", loc="outside lower left", ncols=2)
 
 
 def _limits(values: np.ndarray, log: bool) -> tuple[float | None, float | None]:

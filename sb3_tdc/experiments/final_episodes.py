@@ -18,12 +18,8 @@ from sb3_tdc.experiments.results import Run
 from sb3_tdc.runs.trained import open_run
 
 FILE = "test_returns.npz"
-
-
 EPISODES = 100
-
-
-FIRST_SEED = 10_000
+FIRST_SEED = 10_000  # of the environment, in the first episode
 
 
 def play_final_episodes(model: BaseAlgorithm, env: VecEnv, episodes: int, first_seed: int = FIRST_SEED) -> np.ndarray:

@@ -58,7 +58,7 @@ def test_the_legend_of_many_curves_is_outside(n_curves):
     curve = plot.Evaluated("advb_tdc, seed 1", "A-v0", np.array([1, 2]), np.array([[2.0], [3.0]]))
     plot.draw_curves(axes, [curve] * n_curves)
     drawn.draw_without_rendering()
-    legend = axes.get_legend().get_window_extent()
+    (legend,) = (legend.get_window_extent() for legend in drawn.legends)
     assert legend.x0 >= axes.get_window_extent().x1
     assert legend.x1 <= drawn.bbox.x1
     assert (legend.y0 >= drawn.bbox.y0, legend.y1 <= drawn.bbox.y1) == (True, True)
