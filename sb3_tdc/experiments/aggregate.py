@@ -1,14 +1,13 @@
 """Scores over tasks: which algorithms have runs of one length on the same tasks, and how they compare there."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.groups import Group
-
-FULL = "all steps of hyperparams/"
+from sb3_tdc.experiments.groups import Conditions, Group, as_shipped, by_conditions
 
 
 @dataclass(frozen=True)
@@ -16,15 +15,32 @@ class Aggregate:
     """
     Algorithms as ``hyperparams/`` has them, on tasks on which each has at least two finished seeds.
 
-    :param length: of their runs; :data:`FULL` where tasks have different numbers of steps
-    :param scores: for every algorithm and task (runs,): 0 and 1 are the lowest and the highest single run on the task
-    :param left_out: algorithms with two seeds on some of the tasks, or on others
+    :param length: of their runs
+    :param physics: of their tasks, "" where MuJoCo's version does not matter
+    :param env_ids: the tasks
+    :param groups: for every algorithm, its group on each task
+    :param left_out: other algorithms and tasks of this length
     """
 
     length: str
+    physics: str
     env_ids: tuple[str, ...]
-    scores: dict[str, list[np.ndarray]]
+    groups: dict[str, list[Group]]
     left_out: tuple[str, ...]
+
+    @property
+    def scores(self) -> dict[str, list[np.ndarray]]:
+        """For every algorithm and task (runs,): 0 and 1 are the lowest and the highest single run on the task."""
+        scores: dict[str, list[np.ndarray]] = {label: [] for label in self.groups}
+        for task in range(len(self.env_ids)):
+            final = {label: groups[task].final_returns for label, groups in self.groups.items()}
+            for label, values in statistics.normalise_scores(final).items():
+                scores[label].append(values)
+        return scores
+
+    @property
+    def members(self) -> set[tuple[str, Conditions]]:
+        return {(label, group.conditions) for label, groups in self.groups.items() for group in groups}
 
     def intervals(self) -> list[tuple[float, float, float]]:
         """Return the interquartile mean of every algorithm, and its 95 % stratified bootstrap interval."""
@@ -34,45 +50,63 @@ class Aggregate:
         ]
 
 
-def length_of(group: Group) -> str:
-    """Return :data:`FULL`, or the number of steps of a run of another length than ``hyperparams/`` has."""
-    return FULL if group.n_timesteps == group.shipped_steps else f"{group.n_timesteps:,} steps"
-
-
 def aggregate(groups: Sequence[Group]) -> list[Aggregate]:
     """Return what can be averaged over tasks: at least two algorithms on at least two tasks, at one length."""
-    lengths: dict[tuple[str, str], dict[str, dict[str, Group]]] = {}
-    for group in groups:
-        if len(group.finished) > 1 and group.is_as_shipped:
-            algorithms = lengths.setdefault((length_of(group), group.conditions.mujoco), {})
-            algorithms.setdefault(group.algo.upper(), {})[group.env_id] = group
-    found = (_score(length, algorithms) for (length, _), algorithms in lengths.items())
-    return [one for one in found if one is not None]
+    found: list[Aggregate] = []
+    for (length, physics), tasks in _at_one_length(groups).items():
+        one = _score(length, physics, tasks)
+        if one is not None and not any(one.members <= other.members for other in found):
+            found = [other for other in found if not other.members < one.members] + [one]
+    return found
 
 
-def _score(length: str, algorithms: dict[str, dict[str, Group]]) -> Aggregate | None:
-    labels, env_ids = choose({label: list(of_label) for label, of_label in algorithms.items()})
-    if len(labels) < 2:
-        return None
-    scores: dict[str, list[np.ndarray]] = {label: [] for label in labels}
-    for env_id in env_ids:
-        final = {label: algorithms[label][env_id].final_returns for label in labels}
-        for label, values in statistics.normalise_scores(final).items():
-            scores[label].append(values)
-    return Aggregate(length, env_ids, scores, tuple(label for label in algorithms if label not in labels))
+def describe_share(share: float) -> str:
+    """Return how long a run is, compared with the number of steps in ``hyperparams/``."""
+    return "all steps of hyperparams/" if share == 1 else f"{100 * share:.3g} % of the steps in hyperparams/"
 
 
-def choose(tasks: dict[str, list[str]]) -> tuple[list[str], tuple[str, ...]]:
+def choose(tasks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """
-    Choose algorithms that share at least two tasks: the one with the fewest tasks leaves until they do.
+    Choose at least two algorithms that share at least two tasks: those with the most runs in common.
 
     :param tasks: of every algorithm
-    :return: the algorithms, in the order given, and the tasks of all of them; empty if no two algorithms share two
+    :return: the algorithms and the tasks that all of them have, in the order given; empty if there are none
     """
-    chosen = list(tasks)
-    while len(chosen) > 1:
-        common = [task for task in tasks[chosen[0]] if all(task in tasks[other] for other in chosen)]
-        if len(common) > 1:
-            return chosen, tuple(common)
-        chosen.remove(min(reversed(chosen), key=lambda label: len(tasks[label])))
-    return [], ()
+    best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    for n in range(len(tasks), 1, -1):
+        for labels in combinations(tasks, n):
+            common = tuple(task for task in tasks[labels[0]] if all(task in tasks[label] for label in labels))
+            if len(common) > 1 and n * len(common) > len(best[0]) * len(best[1]):
+                best = labels, common
+    return best
+
+
+def _at_one_length(groups: Sequence[Group]) -> dict[tuple[str, str], dict[str, dict[str, Group]]]:
+    """By length and physics: for every algorithm and task its group. Lengths are numbers of steps and shares."""
+    found: dict[tuple[str, str], dict[str, dict[str, Group]]] = {}
+    for conditions, alike in by_conditions(group for group in groups if group.finished).items():
+        for group in as_shipped(alike):
+            for length in _lengths(conditions, group):
+                algorithms = found.setdefault((length, conditions.mujoco), {})
+                algorithms.setdefault(group.algo.upper(), {})[group.env_id] = group
+    return found
+
+
+def _lengths(conditions: Conditions, group: Group) -> Iterator[str]:
+    yield f"{conditions.n_timesteps:,} steps"
+    if group.shipped_steps:
+        yield describe_share(group.share)
+
+
+def _score(length: str, physics: str, algorithms: dict[str, dict[str, Group]]) -> Aggregate | None:
+    several = {
+        label: [env_id for env_id, group in of_label.items() if len(group.finished) > 1]
+        for label, of_label in algorithms.items()
+    }
+    labels, env_ids = choose(several)
+    if not labels:
+        return None
+    there = [*algorithms, *dict.fromkeys(env_id for of_label in algorithms.values() for env_id in of_label)]
+    left_out = tuple(name for name in there if name not in (*labels, *env_ids))
+    chosen = {label: [algorithms[label][env_id] for env_id in env_ids] for label in labels}
+    return Aggregate(length, physics, env_ids, chosen, left_out)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.groups import Group, by_conditions, is_as_shipped, vary
+from sb3_tdc.experiments.groups import Group, as_shipped, by_conditions, is_as_shipped, vary
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import MUJOCO, PYBULLET
 
@@ -52,9 +52,10 @@ class Claim:
     One comparison.
 
     :param says: what the paper claims
-    :param group: of our side: task and number of steps are those of both
+    :param group: of our side; both are of the same conditions
     :param what: the quantity that is compared
-    :param ours: of the side that the claim favours; :param other: of the other side
+    :param ours: of the side that the claim favours
+    :param other: of the other side
     """
 
     says: str
@@ -180,7 +181,7 @@ _HEADS: dict[str, tuple[str, Verdict]] = {
 
 
 def examine(groups: Sequence[Group]) -> list[Claim]:
-    """Compare what there is for each claim, in the order of the claims, on every task and number of steps."""
+    """Compare what there is for each claim, in the order of the claims, under all conditions."""
     claims = (_returns, _variances, _lambdas, _heads, _td_errors)
     under_conditions = by_conditions((g for g in groups if g.finished), (*MUJOCO, *PYBULLET)).values()
     return [compared for claim in claims for alike in under_conditions for compared in claim(alike)]
@@ -194,7 +195,9 @@ def _returns(groups: Sequence[Group]) -> Iterator[Claim]:
 def _variances(groups: Sequence[Group]) -> Iterator[Claim]:
     for plain, rival in _rivals(groups):
         yield _claim("2. λ-LCB varies less", _SEEDS, plain, rival, judge_spread)
-        yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, rival, judge_smaller)
+        # More episodes an evaluation, or more evaluations, and their scatter is another one
+        if all(plain.setting(key) == rival.setting(key) for key in ("eval_freq", "eval_episodes")):
+            yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, rival, judge_smaller)
 
 
 def _lambdas(groups: Sequence[Group]) -> Iterator[Claim]:
@@ -219,9 +222,9 @@ def _td_errors(groups: Sequence[Group]) -> Iterator[Claim]:
 
 def _rivals(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
     """Pairs of TDC and a rival on a task of the paper, both as ``hyperparams/`` has them."""
-    as_shipped = [group for group in groups if group.is_as_shipped and group.env_id in (*MUJOCO, *PYBULLET)]
-    for plain in (group for group in as_shipped if group.algo == "tdc"):
-        for rival in (group for group in as_shipped if group.algo in RIVALS):
+    shipped = [group for group in as_shipped(groups) if group.env_id in (*MUJOCO, *PYBULLET)]
+    for plain in (group for group in shipped if group.algo == "tdc"):
+        for rival in (group for group in shipped if group.algo in RIVALS):
             yield plain, rival
 
 
@@ -235,4 +238,4 @@ def _ablations(groups: Sequence[Group], key: str, *env_ids: str) -> list[list[Gr
 def _claim(says: str, quantity: Quantity, ours: Group, other: Group, verdict: Verdict) -> Claim:
     what, measure = quantity
     intervals = measure(ours), measure(other)
-    return Claim(says, ours, what, (ours.label, other.label), *intervals, verdict(*intervals))
+    return Claim(says, ours, what, (ours.name, other.name), *intervals, verdict(*intervals))

@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_tdc.experiments import figures, statistics
 from sb3_tdc.experiments.ablations import ABLATIONS
-from sb3_tdc.experiments.groups import Group
+from sb3_tdc.experiments.groups import Group, as_shipped
 from sb3_tdc.experiments.results import Run
 
 _BIN = 20_000  # environment steps, at the paper's scale
@@ -17,14 +17,17 @@ def headline(groups: Sequence[Group]) -> list[Group]:
     """
     Choose what a figure on algorithms shows, of groups under the same conditions.
 
-    Each algorithm as ``hyperparams/`` has it; where it has not been run so, all of it. Ablations have their own figure.
+    Each algorithm as ``hyperparams/`` has it; where it has not been run so to the end, all of it. Ablations have their
+    own figure, and groups without evaluations none.
     """
-    shipped = {group.algo for group in groups if group.is_as_shipped}
-    return [g for g in groups if g.algo not in ABLATIONS and (g.is_as_shipped or g.algo not in shipped)]
+    evaluated = [g for g in groups if any(run.evaluations for run in g.runs) and g.algo not in ABLATIONS]
+    shipped = as_shipped([group for group in evaluated if group.finished])
+    algos = {group.algo for group in shipped}
+    return [group for group in evaluated if group in shipped or group.algo not in algos]
 
 
 def bin_width(group: Group) -> int:
-    """20,000 steps, scaled; a multiple of the distance of evaluations, so that every bin has as many."""
+    """20,000 steps, scaled; a multiple of the distance of the group's evaluations, so that every bin has as many."""
     scale = group.n_timesteps / group.shipped_steps if group.shipped_steps else 1.0
     frequency = max(group.setting("eval_freq") or 0, 1)
     return max(round(_BIN * scale / frequency), 1) * frequency

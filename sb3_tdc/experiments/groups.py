@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sb3_tdc.algorithms import ALGORITHMS
-from sb3_tdc.experiments.results import Run, canonical, default_settings, flatten
+from sb3_tdc.experiments.results import Run, canonical, default_settings, flatten, same_settings
 from sb3_tdc.experiments.statistics import final_return
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 
@@ -20,8 +20,8 @@ class Conditions:
     """
     What runs have in common that are compared with each other, and drawn in one figure.
 
-    :param mujoco: "before 3.5" or "since 3.5", which move Hopper, Ant and Humanoid otherwise; "" where it is not known,
-        or does not matter
+    :param mujoco: "before 3.5" or "since 3.5", which move Hopper, Ant and Humanoid otherwise, or "of unknown version";
+        "" where it does not matter
     """
 
     env_id: str
@@ -33,13 +33,17 @@ class Conditions:
 
     @property
     def task(self) -> str:
-        """The environment, and MuJoCo's version where published returns were made with another one."""
-        return f"{self.env_id}, MuJoCo {self.mujoco}" if self.mujoco.startswith("since") else self.env_id
+        """The environment, and MuJoCo's version unless it is the one that published returns were made with."""
+        return f"{self.env_id}, MuJoCo {self.mujoco}" if self._is_other_mujoco else self.env_id
 
     @property
     def file_name(self) -> str:
-        version = "-mujoco-since-3.5" if self.mujoco.startswith("since") else ""
+        version = f"-mujoco-{self.mujoco.replace(' ', '-')}" if self._is_other_mujoco else ""
         return f"{self.env_id}-{self.n_timesteps}{version}"
+
+    @property
+    def _is_other_mujoco(self) -> bool:
+        return self.mujoco not in ("", "before 3.5")
 
 
 @dataclass(frozen=True)
@@ -84,18 +88,28 @@ class Group:
     @property
     def final_returns(self) -> np.ndarray:
         """(runs,), the mean of the last evaluation of every finished run"""
-        return np.array([final_return(run.evaluations.returns) for run in self.finished if run.evaluations])
+        return np.array([final_return(run.evaluations.returns) for run in self.finished if run.evaluations is not None])
 
     @property
     def late_returns(self) -> np.ndarray:
-        """(runs,), the mean of the evaluations in the last third of every finished run"""
-        return np.array([run.late_evaluations().mean() for run in self.finished])
+        """(runs,), the mean of the evaluations in the last third of every finished run that has any there"""
+        return np.array([late.mean() for run in self.finished if len(late := run.late_evaluations())])
 
     @property
     def shipped_steps(self) -> int:
         """Environment steps of the hyperparameter file, those of the paper for its tasks; 0 if there is no file."""
-        entry = _shipped(self.algo, self.env_id)
-        return entry.get("n_timesteps", 0)
+        return _shipped(self.algo, self.env_id).get("n_timesteps", 0)
+
+    @property
+    def share(self) -> float:
+        """Of the steps of the hyperparameter file; NaN if there is no file."""
+        return round(self.n_timesteps / self.shipped_steps, 6) if self.shipped_steps else float("nan")
+
+    @property
+    def name(self) -> str:
+        """The algorithm, and in what it differs from ``hyperparams/``: for tables of many tasks."""
+        differing = hyperparameters_not_shipped(self.runs[0]) if _shipped(self.algo, self.env_id) else {}
+        return f"{self.algo.upper()}, {describe(differing)}" if differing else self.label
 
     @property
     def commits(self) -> tuple[str, ...]:
@@ -114,17 +128,17 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
     """
     Put together what may be averaged: runs of one algorithm and environment that differ in their seed alone.
 
-    A second run of one seed is a repetition, not another seed: of several, the last finished one stays.
+    A second run of one seed is a repetition, not another seed: of several, the last one that can be averaged stays.
     """
     found: dict[str, dict[int, Run]] = {}
     for run in runs:
         seeds = found.setdefault(_identity(run), {})
-        if run.seed not in seeds or run.is_finished or not seeds[run.seed].is_finished:
+        if run.seed not in seeds or _rank(run) >= _rank(seeds[run.seed]):
             seeds[run.seed] = run
     members = [tuple(seeds[seed] for seed in sorted(seeds)) for seeds in found.values()]
     groups = [Group(_label(group[0], [other[0] for other in members]), group) for group in members]
-    order = list(ALGORITHMS)
-    return sorted(groups, key=lambda g: (g.conditions, order.index(g.algo) if g.algo in order else 99, g.label))
+    place = {algo: i for i, algo in enumerate(ALGORITHMS)}
+    return sorted(groups, key=lambda g: (g.conditions, place.get(g.algo, len(place)), g.label))
 
 
 def by_conditions(groups: Iterable[Group], tasks: Sequence[str] = ()) -> dict[Conditions, list[Group]]:
@@ -159,26 +173,49 @@ def is_same_but(what: str, one: Group, other: Group) -> bool:
     return _identity(one.runs[0], without=what) == _identity(other.runs[0], without=what)
 
 
+def as_shipped(groups: Sequence[Group]) -> list[Group]:
+    """
+    Return one group for each algorithm, with the hyperparameters of ``hyperparams/``.
+
+    :param groups: under the same conditions; of several that differ in their evaluations or their warm-up, the one with
+        the most finished seeds is taken
+    """
+    found: dict[str, Group] = {}
+    for group in groups:
+        if group.is_as_shipped and (group.algo not in found or len(group.finished) > len(found[group.algo].finished)):
+            found[group.algo] = group
+    return list(found.values())
+
+
 def is_as_shipped(run: Run, but: Iterable[str] = ()) -> bool:
     """
     Return whether a run has the hyperparameters of this package's ``hyperparams/``, whatever its length.
 
-    The matrix shortens a warm-up to a tenth of a short run.
-
     :param but: settings that may be others
     """
-    differing = set(differences(run)) - _NOT_HYPERPARAMETERS - set(but)
-    is_shortened = run.setting("learning_starts") == run.n_timesteps // 10
-    return not differing - ({"learning_starts"} if is_shortened else set())
+    return not set(hyperparameters_not_shipped(run)) - set(but)
+
+
+def hyperparameters_not_shipped(run: Run) -> dict[str, Any]:
+    """
+    Return the hyperparameters that are not those of ``hyperparams/``.
+
+    A warm-up that the matrix has shortened, to a tenth of a short run, is not among them.
+    """
+    differing = {key: value for key, value in differences(run).items() if key not in _NOT_HYPERPARAMETERS}
+    warm_up = _shipped(run.algo, run.env_id).get("learning_starts")
+    if warm_up is not None and run.setting("learning_starts") == min(warm_up, run.n_timesteps // 10):
+        differing.pop("learning_starts", None)
+    return differing
 
 
 def differences(run: Run) -> dict[str, Any]:
     """Return the settings that are not those of this package's ``hyperparams/``, as they are in the run."""
-    shipped = Run(run.folder, run.algo, run.env_id, run.seed, _shipped(run.algo, run.env_id))
+    shipped = {**default_settings(run.algo), **_shipped(run.algo, run.env_id)}
     return {
         key: run.setting(key)
-        for key in {**shipped.settings, **run.settings}
-        if canonical(run.setting(key)) != canonical(shipped.setting(key))
+        for key in {**_shipped(run.algo, run.env_id), **run.settings}
+        if not same_settings(run.setting(key), shipped.get(key))
     }
 
 
@@ -194,7 +231,7 @@ def shared_differences(groups: Sequence[Group]) -> str:
         common = {
             key: value
             for key, value in found[0].items()
-            if key not in _NOT_HYPERPARAMETERS and all(canonical(o.get(key)) == canonical(value) for o in found)
+            if key not in _NOT_HYPERPARAMETERS and all(same_settings(other.get(key), value) for other in found)
         }
         if common:
             said.append(f"all {algo.upper()}: {describe(common)}")
@@ -223,6 +260,10 @@ def _shipped(algo: str, env_id: str) -> dict[str, Any]:
         return flatten(read_entry(hyperparams_file(algo), env_id)[0])
     except ValueError:  # of another package
         return {}
+
+
+def _rank(run: Run) -> int:
+    return run.is_finished + (run.is_complete and run.evaluations is not None)
 
 
 def _conditions(run: Run) -> Conditions:

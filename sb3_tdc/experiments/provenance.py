@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -53,14 +54,15 @@ def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
 
 
 def _count_seeds(runs: Sequence[Run]) -> str:
-    """``"3 (300,000 steps), 1 (100,000 steps), 2 unfinished"``; "–" without any."""
-    seeds: dict[int, set[int]] = {}
+    """``"3 (300,000 steps), 1 (100,000 steps), 2 not averaged"``; "–" without any."""
+    averaged: dict[int, set[int]] = {}
+    others: dict[int, set[int]] = {}
     for run in runs:
-        if run.is_complete:
-            seeds.setdefault(run.n_timesteps, set()).add(run.seed)
-    said = [f"{len(seeds[steps])} ({steps:,} steps)" for steps in sorted(seeds, reverse=True)]
-    unfinished = sum(not run.is_finished for run in runs)
-    return ", ".join([*said, *([f"{unfinished} unfinished"] if unfinished else [])]) or "–"
+        kind = averaged if run.is_complete and run.evaluations is not None else others
+        kind.setdefault(run.n_timesteps, set()).add(run.seed)
+    said = [f"{len(averaged[steps])} ({steps:,} steps)" for steps in sorted(averaged, reverse=True)]
+    n_others = sum(len(seeds - averaged.get(steps, set())) for steps, seeds in others.items())
+    return ", ".join([*said, *([f"{n_others} not averaged"] if n_others else [])]) or "–"
 
 
 def _column(cell: Cell) -> str:
@@ -102,12 +104,17 @@ def describe_groups(groups: Sequence[Group]) -> pd.DataFrame:
                 "Algorithm": group.label,
                 "Steps": f"{group.n_timesteps:,}",
                 "Finished seeds": group.seeds,
-                "Commits of sb3_tdc": ", ".join(commit[:7] or "not known" for commit in group.commits) or "–",
+                "Commits of sb3_tdc": "; ".join(map(_short, group.commits)) or "–",
                 "Differs from hyperparams/": describe(differences(group.runs[0])) or "nothing",
             }
             for group in groups
         ]
     )
+
+
+def _short(commit: str) -> str:
+    """``"0123456…, with uncommitted changes"`` → "0123456, with uncommitted changes"."""
+    return re.sub(r"^([0-9a-f]{7})[0-9a-f]+", r"\1", commit) or "not known"
 
 
 def describe_runs(runs: Sequence[Run]) -> pd.DataFrame:

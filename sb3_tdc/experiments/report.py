@@ -18,12 +18,12 @@ from sb3_tdc.experiments.sections import Report
 
 def warnings(groups: Sequence[Group]) -> list[str]:
     """What a reader must know before looking at a figure."""
-    shares = sorted({g.n_timesteps / g.shipped_steps for g in groups if g.finished and g.shipped_steps})
+    shares = sorted({g.share for g in groups if g.finished and g.shipped_steps})
     fewest = min((len(g.finished) for g in groups if g.finished), default=0)
     said = []
-    if not shares:
-        said.append("No run is finished: there is nothing to average yet.")
-    elif shares[0] < 1:
+    if not fewest:
+        said.append("No run is finished and evaluated: there is nothing to average yet.")
+    if shares and shares[0] < 1:
         share = (
             f"{100 * shares[0]:.3g} %"
             if shares[0] == shares[-1]
@@ -50,10 +50,8 @@ def warnings(groups: Sequence[Group]) -> list[str]:
 
 def _describe_board(group: Group) -> str:
     steps = [int(logged[-1]) for run in group.finished if len(logged := run.progress("board/test_steps"))]
-    more = f"{max(steps):,}" if steps else "a number, not published, of"
-    return (
-        f"its board acts in evaluations, and {more} environment steps of test episodes a run are not among its steps."
-    )
+    further = f"up to {max(steps):,} further environment steps" if steps else "further steps that the log does not give"
+    return f"the board acts in evaluations. Its test episodes took {further} a run, which are not counted."
 
 
 def _remove_old(folder: Path) -> None:

@@ -211,8 +211,10 @@ def _by_number(path: Path) -> tuple[Path, str, int]:
 def _physics(env_id: str, versions: Mapping[str, str]) -> dict[str, str]:
     """Return which MuJoCo moved a task of MuJoCo: its contacts are others since 3.5 (docs/differences.md)."""
     version = re.match(r"(\d+)\.(\d+)", str(versions.get("mujoco", "")))
-    if version is None or not _may_use_mujoco(env_id):
+    if not _may_use_mujoco(env_id):
         return {}
+    if version is None:
+        return {"mujoco": "of unknown version"}
     return {"mujoco": "since 3.5" if tuple(map(int, version.groups())) >= (3, 5) else "before 3.5"}
 
 

@@ -3,7 +3,7 @@
 import base64
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_tdc.common.words import count, listed
+from sb3_tdc.common.words import count, counted, listed
 from sb3_tdc.experiments import figures, provenance, tables
 from sb3_tdc.experiments.ablations import ABLATIONS
 from sb3_tdc.experiments.aggregate import Aggregate, aggregate
@@ -98,11 +98,12 @@ class Report:
         episodes = sorted({run.evaluations.returns.shape[1] for g in groups for run in g.runs if run.evaluations})
         return self.draw(
             f"{name}-{conditions.file_name}",
-            f"{_about(conditions)}; bins of {width:,} steps. {_seeds(groups, labels)} {shared_differences(groups)}",
+            f"{_about(conditions)}; bins of {width:,} steps. {_seeds(labels, [g.seeds for g in groups])} "
+            f"{shared_differences(groups)}",
             figures.draw_curves,
             curves,
             conditions.task,
-            f"return of {listed(list(map(str, episodes))) or 'no'} mean-action episodes",
+            f"return of {counted(episodes, 'mean-action episode')}",
             published=[curve for curve in published_curves(conditions.env_id) if curve.algorithm == "SAC"],
         )
 
@@ -113,8 +114,10 @@ class Report:
             "but never below the distance of evaluations. Thick: mean over seeds; band: 95 % interval of that mean "
             "(Student's t over seeds); thin: single seeds. One seed has no band. Unfinished runs are dotted and not "
             "averaged. The band of two seeds is huge, and runs off the axis, which is made for the seeds. Dashed: SAC "
-            "as the repository of SimbaV2 has published it, with the interval of its seeds. Algorithms are shown as "
-            "hyperparams/ has them, where they have been run so. One figure for each number of steps.",
+            "as the repository of SimbaV2 has published it, with the interval of its seeds (MuJoCo before 3.5). "
+            "Algorithms are shown as hyperparams/ has them, where they have been run so. One figure for each task, "
+            "number of steps and MuJoCo (before or since 3.5). Where some were evaluated more often than others, a bin "
+            "averages more of their evaluations.",
         )
         for groups in self.conditions.values():
             if shown := headline(groups):
@@ -137,23 +140,24 @@ class Report:
         )
         if len(self.returns):
             section.tables.append(("", tables.show_returns(self.returns)))
-        for one in aggregate(self.groups):
-            self.add_aggregate(section, one)
+        for number, one in enumerate(aggregate(self.groups), 1):
+            self.add_aggregate(section, f"aggregate-{number}", one)
         return section
 
-    def add_aggregate(self, section: Section, found: Aggregate) -> None:
+    def add_aggregate(self, section: Section, name: str, found: Aggregate) -> None:
         """Draw the scores over tasks, and write them as CSV."""
         labels, intervals, tasks = list(found.scores), found.intervals(), listed(found.env_ids)
-        name = f"aggregate-{found.length.split()[0].replace(',', '')}"
         table = pd.DataFrame(intervals, columns=["iqm", "low", "high"])
-        self.write_table(name, table.assign(algorithm=labels, tasks=tasks, length=found.length))
-        left_out = f" Not on all of these tasks with two seeds: {listed(found.left_out)}." if found.left_out else ""
+        table = table.assign(algorithm=labels, tasks=tasks, length=found.length, mujoco=found.physics)
+        self.write_table(name, table)
+        physics = f", MuJoCo {found.physics}" if found.physics else ""
+        left_out = f" Left out, for want of two seeds: {listed(found.left_out)}." if found.left_out else ""
         section.pictures.append(
             self.draw(
                 name,
-                f"Final returns over {tasks}, {found.length}: interquartile mean of scores with 95 % stratified "
-                "bootstrap interval. 0 and 1 are the lowest and highest single run on a task, of those that are "
-                f"compared here.{left_out}",
+                f"Final returns over {tasks}, {found.length}{physics}: interquartile mean of scores with its 95 % "
+                "stratified bootstrap interval. 0 and 1 are the lowest and highest single run on a task, of those that "
+                f"are compared here.{left_out}",
                 figures.draw_intervals,
                 [f"{label}\n{count(sum(map(len, found.scores[label])), 'run')}" for label in labels],
                 figures.colors_of(labels),
@@ -166,10 +170,10 @@ class Report:
     def lambda_sweep(self) -> Section:
         section = Section(
             "λ (Fig. 3)",
-            "Groups that differ in λ alone. Left of each pair: learning curves; right: final return against λ, every "
-            "seed a dot, mean and 95 % t interval where there are several; a λ that calibrates itself has no place on "
-            "that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and HalfCheetah. Then variants of TDC "
-            "next to the runs that they are compared with.",
+            "Groups that differ in λ alone: learning curves, and, of at least two fixed λ, the final return against λ, "
+            "every seed a dot, mean and 95 % t interval where there are several. A λ that calibrates itself, or is a "
+            "schedule, has no place on that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and "
+            "HalfCheetah. Then variants of TDC next to the runs that they are compared with.",
         )
         import matplotlib
 
@@ -198,7 +202,8 @@ class Report:
             tables.make_variants_table(self.groups),
             "Variants of TDC, each against the control that differs in one thing: mean ± standard deviation over "
             "seeds of the evaluations in the last third of a run; the difference with Welch's 95 % interval; its "
-            "p-value, corrected for the number of variants on the task by Holm's method.",
+            "p-value, corrected by Holm's method for the number of variants with several seeds on the same task, of as "
+            "many steps.",
         )
         return section
 
@@ -207,7 +212,7 @@ class Report:
         conditions, values = groups[0].conditions, [group.setting("lam") for group in groups]
         return self.draw(
             f"{name}-{conditions.file_name}",
-            f"{_about(conditions)}. {_seeds(groups, [f'λ = {value:g}' for value in values])} "
+            f"{_about(conditions)}. {_seeds([f'λ = {value:g}' for value in values], [g.seeds for g in groups])} "
             f"{shared_differences(groups)}",
             figures.draw_sweep,
             values,
@@ -253,7 +258,7 @@ class Report:
             section.pictures.append(
                 self.draw(
                     f"td-error-variance-{conditions.file_name}",
-                    f"{_about(conditions)}; bins of {width:,} steps. {_seeds(shown, labels)} "
+                    f"{_about(conditions)}; bins of {width:,} steps. {_seeds(labels, [g.seeds for g in shown])} "
                     f"{shared_differences(shown)}",
                     figures.draw_curves,
                     curves,
@@ -285,7 +290,7 @@ class Report:
             section.pictures.append(
                 self.draw(
                     f"test-returns-{conditions.file_name}",
-                    f"After {_about(conditions)}. {_seeds([], labels, [len(returns) for _, returns in played])} "
+                    f"After {_about(conditions)}. {_seeds(labels, [len(returns) for _, returns in played])} "
                     + (f"Without test episodes: {listed(missing)}. " if missing else "")
                     + shared_differences([group for group, _ in played]),
                     figures.draw_box_plots,
@@ -318,11 +323,11 @@ class Report:
     def claims(self) -> Section:
         section = Section(
             "The paper's claims",
-            "What the paper says, against the runs that are here, on the tasks that it says it of, for every number "
-            "of steps. A verdict needs 95 % intervals over seeds that do not overlap (Student's t for means, χ² for "
-            "standard deviations over seeds). Returns are comparable, and heads interchangeable, if the intervals lie "
-            "within a tenth of each other. Everything else is undecided: one seed decides nothing, and fewer than "
-            f"{MIN_SEEDS_OF_SPREAD} decide nothing about a standard deviation over seeds.",
+            "What the paper says, against the runs that are here, on the tasks that it says it of, for each number "
+            "of steps and MuJoCo. A verdict needs 95 % intervals over seeds that do not overlap (Student's t for "
+            "means, χ² for standard deviations over seeds). Returns are comparable, and heads interchangeable, if the "
+            "intervals lie within a tenth of each other. Everything else is undecided: one seed decides nothing, and "
+            f"fewer than {MIN_SEEDS_OF_SPREAD} decide nothing about a standard deviation over seeds.",
         )
         self.add_table(section, "claims", tables.make_claims_table(self.groups))
         return section
@@ -365,7 +370,6 @@ def _about(conditions: Conditions) -> str:
     return f"{conditions.n_timesteps:,} steps{physics}"
 
 
-def _seeds(groups: Sequence[Group], labels: Sequence[str], numbers: Sequence[int] | None = None) -> str:
-    """Seeds of each line of a figure: ``"Seeds: TDC 3 (1, 2, 3); SAC 1 (1)."``."""
-    counted = [group.seeds for group in groups] if numbers is None else list(map(str, numbers))
-    return "Seeds: " + "; ".join(f"{label}: {seeds}" for label, seeds in zip(labels, counted, strict=True)) + "."
+def _seeds(labels: Sequence[str], seeds: Iterable[object]) -> str:
+    """Seeds of each line of a figure: ``"Seeds: TDC: 3 (1, 2, 3); SAC: 1 (1)."``."""
+    return "Seeds: " + "; ".join(f"{label}: {which}" for label, which in zip(labels, seeds, strict=True)) + "."

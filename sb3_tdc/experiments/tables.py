@@ -1,7 +1,7 @@
 """Tables: groups of runs → numbers (for CSV) → cells to read (for the report)."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import pandas as pd
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.words import count
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.aggregate import length_of
 from sb3_tdc.experiments.claims import Interval, examine
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
 from sb3_tdc.experiments.groups import Conditions, Group, by_conditions
@@ -28,7 +27,7 @@ def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
     """One row for each group with a finished run, in units of return; NaN where one seed says nothing."""
     rows = []
     for group in groups:
-        curves = [run.evaluations for run in group.finished if run.evaluations]
+        curves = [run.evaluations for run in group.finished if run.evaluations is not None]
         if not curves:
             continue
         final = group.final_returns
@@ -40,10 +39,10 @@ def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
         rows.append(
             {
                 "environment": group.env_id,
-                "algorithm": group.label,
+                "algorithm": group.name,
                 "mujoco": group.conditions.mujoco,
                 "steps": group.n_timesteps,
-                "length": length_of(group),
+                "share": group.share,
                 "seeds": len(curves),
                 "episodes": curves[0].returns.shape[1],
                 "final_mean": final.mean(),
@@ -103,7 +102,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     ours = [row for row in table.to_dict("records") if row["environment"].rpartition("-")[0] in TASKS]
-    for (algorithm, version, *_), some in _grouped(ours).items():
+    for (algorithm, version), some in _rows_over_tasks(ours):
         by_task = {row["environment"].rpartition("-")[0]: row for row in some}
         rows.append(
             {
@@ -150,7 +149,7 @@ def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
         where = conditions.task, f"{conditions.n_timesteps:,}"
         for group in alike:
             returns = _with_interval(*map(float, statistics.mean_interval(group.final_returns)))
-            rows.append((*where, f"{group.label}: this report", returns, str(len(group.finished))))
+            rows.append((*where, f"{group.name}: this report", returns, str(len(group.finished))))
         for curve, *interval in published:
             rows.append((*where, f"{curve.algorithm}: published", _with_interval(*interval), str(curve.seeds)))
     return pd.DataFrame(rows, columns=["Environment", "Steps", "Algorithm", "Return", "Seeds"])
@@ -180,7 +179,7 @@ def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
         rows.append(
             {
                 "Environment": group.conditions.task,
-                "Algorithm": group.label,
+                "Algorithm": group.name,
                 "Steps": number(group.n_timesteps),
                 "Seeds": len(group.finished),
                 **{title: _over_seeds(values) for title, values in logged.items()},
@@ -244,7 +243,7 @@ def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 def _of_returns(group: Group, returns: np.ndarray) -> str:
     mean = plus_minus(returns.mean(), statistics.spread(returns))
-    return f"{group.label}: {mean} ({count(len(returns), 'seed')})"
+    return f"{group.name}: {mean} ({count(len(returns), 'seed')})"
 
 
 def _of_seeds(interval: Interval) -> str:
@@ -277,10 +276,23 @@ def _per_task(values: dict[str, str]) -> str:
     return " / ".join(values.get(task, "–") for task in TASKS)
 
 
-def _grouped(rows: list[dict[str, Any]]) -> dict[tuple[str, str, str, str], list[dict[str, Any]]]:
-    """By algorithm, version of the tasks, length and physics: a row of the table has one number for each task."""
-    groups: dict[tuple[str, str, str, str], list[dict[str, Any]]] = {}
+def _rows_over_tasks(rows: list[dict[str, Any]]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
+    """
+    Put tasks into one row: of one algorithm, version and physics, and of one length, which is a number of steps or a
+    share of those in ``hyperparams/``, whichever makes fewer rows.
+    """
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         version = row["environment"].rpartition("-")[2]
-        groups.setdefault((row["algorithm"], version, row["length"], row["mujoco"]), []).append(row)
-    return groups
+        physics = f"{version}, MuJoCo {row['mujoco']}" if row["mujoco"] else version
+        found.setdefault((row["algorithm"], physics), []).append(row)
+    for what, some in found.items():
+        by_length = [_split(some, key) for key in ("steps", "share")]
+        yield from ((what, of_length) for of_length in min(by_length, key=len))
+
+
+def _split(rows: list[dict[str, Any]], key: str) -> list[list[dict[str, Any]]]:
+    found: dict[Any, list[dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row[key], []).append(row)
+    return list(found.values())

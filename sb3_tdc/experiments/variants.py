@@ -3,7 +3,7 @@ Variants of TDC, each against the control that differs from it in one thing: doe
 
 Compared is the mean of a run's evaluations in its last third, fixed before any run was made: less noisy than the last
 evaluation. Differences have Welch's interval over seeds; a verdict needs a p-value below 5 % after Holm's correction
-for the number of variants on that task.
+for the number of variants with several seeds, under the same conditions (task, number of steps, MuJoCo).
 """
 
 from collections.abc import Iterator, Sequence
@@ -45,7 +45,7 @@ class Comparison:
 
 def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
     """
-    Return the comparisons of every task and number of steps.
+    Return the comparisons under all conditions.
 
     λ is compared with λ = 0, and an algorithm of the ablations with TDC of the same hyperparameters.
     """

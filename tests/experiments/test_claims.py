@@ -8,7 +8,6 @@ from sb3_tdc.experiments import claims, statistics, tables
 from sb3_tdc.experiments.claims import Interval, examine
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import find_runs
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from tests.helpers.run_folders import make_run
 
 
@@ -28,10 +27,8 @@ def compare(folder):
 
 def make_runs(folder, finals, algo="tdc", env_id="Hopper-v4", log=None, **changed):
     """Runs with the hyperparameters of ``hyperparams/``, but for what is changed. Their last evaluation is late."""
-    shipped, _ = read_entry(hyperparams_file(algo), env_id)
-    config = {**shipped, "n_timesteps": 1000, "learning_starts": 100, **changed}
     for seed, final in enumerate(finals, 1):
-        make_run(folder, algo, env_id, seed=seed, returns=((0.0, 0.0), (final, final)), log=log, **config)
+        make_run(folder, algo, env_id, seed=seed, returns=((0.0, 0.0), (final, final)), log=log, **changed)
 
 
 def test_intervals_that_do_not_overlap_decide():
@@ -87,6 +84,12 @@ def test_a_run_that_improves_does_not_scatter(tmp_path):
     # Slope Σxy/Σx² = (−1.5 + 0.5 + 0.5 − 1.5)/5 = −0.4; residuals 0.4, −1.2, 1.2, −0.4; √(3.2/2)
     assert found[0.2] == pytest.approx(1.6**0.5)
     assert np.isnan(found[0.3])  # two points are always on a line
+
+
+def test_the_scatter_of_other_evaluations_is_not_compared(tmp_path):
+    make_runs(tmp_path, (1, 2, 3))
+    make_run(tmp_path, "td3", returns=((0.0,), (1.0,)), args={"eval_episodes": 1})
+    assert {claim.what.split()[0] for claim in number(2, tmp_path)} == {"standard"}
 
 
 def test_heads_are_judged_as_the_paper_says_of_the_task(tmp_path):
@@ -164,7 +167,7 @@ def test_what_hyperparams_say_is_what_is_judged(tmp_path):
     make_runs(tmp_path, (50, 51), algo="td3")
     make_runs(tmp_path, (100, 101), lam=0.0)
     assert compare(tmp_path) == {}
-    for steps in (1000, 400):  # the labels name the steps
+    for steps in (1000, 400):
         of_that_length = {"n_timesteps": steps, "learning_starts": steps // 10, "steps": steps}
         make_runs(tmp_path / "as_shipped", (100, 101), **of_that_length)
         make_runs(tmp_path / "as_shipped", (50, 51), algo="td3", **of_that_length)

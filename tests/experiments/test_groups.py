@@ -1,5 +1,6 @@
 """Runs → groups that may be averaged, and what may be compared."""
 
+import numpy as np
 import pytest
 
 from sb3_tdc.experiments.groups import (
@@ -13,7 +14,6 @@ from sb3_tdc.experiments.groups import (
 )
 from sb3_tdc.experiments.provenance import list_unfinished
 from sb3_tdc.experiments.results import find_runs
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from tests.helpers.run_folders import NETWORKS, make_run
 
 
@@ -128,11 +128,10 @@ def test_what_is_compared_has_one_length(tmp_path):
 
 
 def test_as_shipped_whatever_the_length(tmp_path):
-    shipped, _ = read_entry(hyperparams_file("tdc"), "Hopper-v4")
-    base = {**shipped, "n_timesteps": 1000}
-    for seed, changed in enumerate(({}, {"learning_starts": 100}, {"learning_starts": 99}, {"kappa": 2.0})):
-        make_run(tmp_path, seed=seed, **{**base, **changed})
-    make_run(tmp_path, seed=4, args={"eval_freq": 7, "eval_episodes": 1}, **base)
+    warm_ups = ({"learning_starts": 5000}, {"learning_starts": 100}, {"learning_starts": 99})
+    for seed, changed in enumerate((*warm_ups, {"kappa": 2.0})):
+        make_run(tmp_path, seed=seed, **changed)
+    make_run(tmp_path, seed=4, args={"eval_freq": 7, "eval_episodes": 1})
     found = {run.seed: is_as_shipped(run) for run in find_runs(tmp_path)[0]}
     assert found == {0: True, 1: True, 2: False, 3: False, 4: True}
     other = next(run for run in find_runs(tmp_path)[0] if run.seed == 3)
@@ -164,3 +163,36 @@ def test_of_two_runs_of_one_seed_the_later_one_counts_after_nine_too(tmp_path):
         make_run(tmp_path, seed=1, returns=((float(i),),))
     (group,) = group_runs(find_runs(tmp_path)[0])
     assert group.runs[0].folder.path.name == "Hopper-v4_11"
+
+
+def test_a_longer_warm_up_is_not_as_shipped(tmp_path):
+    make_run(tmp_path, n_timesteps=300_000, learning_starts=30_000)  # in hyperparams/: 5,000
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert not group.is_as_shipped
+    assert group.name == "TDC, learning_starts 30,000"
+    assert group.label == "TDC"  # there is no other to tell it from
+
+
+def test_a_repetition_that_ended_early_replaces_nothing(tmp_path):
+    make_run(tmp_path, seed=1, args={"resume_freq": 100}, returns=((1.0,),)).mark_finished(1000)
+    make_run(tmp_path, seed=1, args={"resume_freq": 100}, returns=((2.0,),), steps=400).mark_finished(400)
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert group.final_returns.tolist() == [1]
+
+
+def test_physics_that_are_not_known_are_no_known_physics(tmp_path):
+    for seed, text in ((1, "mujoco: 3.4.0"), (2, "torch: 2.13.0")):
+        run = make_run(tmp_path, seed=seed)
+        (run.path / run.env_name / "versions.yml").write_text(text)
+    groups = group_runs(find_runs(tmp_path)[0])
+    assert {g.conditions.task for g in groups} == {"Hopper-v4", "Hopper-v4, MuJoCo of unknown version"}
+    assert len({g.conditions.file_name for g in groups}) == 2
+
+
+def test_no_late_evaluation_is_no_late_return(tmp_path):
+    for seed, (steps, returns) in enumerate((((300,), ((1.0,),)), ((300, 1000), ((1.0,), (5.0,)))), 1):
+        run = make_run(tmp_path, seed=seed)
+        np.savez(run.path / "evaluations.npz", timesteps=steps, results=returns)
+    (group,) = group_runs(find_runs(tmp_path)[0])
+    assert len(group.finished) == 2
+    assert group.late_returns.tolist() == [5]

@@ -45,8 +45,8 @@ def test_the_table_compares_at_our_number_of_steps(tmp_path):
             env_id="Hopper-v4",
             seed=seed,
             steps=100_000,
-            n_timesteps=100_000,
             returns=((last, last),),
+            n_timesteps=100_000,
         )
     make_run(tmp_path, algo="sac", env_id="Pendulum-v1", steps=1000)  # nothing is published for it
     table = tables.make_published_curves_table(group_runs(find_runs(tmp_path)[0]))

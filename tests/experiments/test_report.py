@@ -1,6 +1,7 @@
 """Tables, figures and the page: from folders made by hand, then from real runs."""
 
 import re
+import shutil
 
 import markupsafe
 import numpy as np
@@ -14,7 +15,6 @@ from sb3_tdc.cli import report as report_command
 from sb3_tdc.experiments import curves, figures, final_episodes, provenance, report, sections, tables
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import Run, find_runs
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.trained import TrainedModel
 from tests.helpers.run_folders import make_run
 
@@ -164,15 +164,14 @@ def test_bins_scale_with_the_run_but_hold_an_evaluation(tmp_path):
 def test_what_is_missing_is_said(tmp_path, monkeypatch):
     others = {name: algorithm for name, algorithm in ALGORITHMS.items() if name != "meow"}
     monkeypatch.setattr(provenance, "ALGORITHMS", others)
-    shipped = {**read_entry(hyperparams_file("tdc"), "Hopper-v4")[0], "n_timesteps": 1000, "learning_starts": 100}
-    make_run(tmp_path, seed=1, **shipped)
-    make_run(tmp_path, seed=2, steps=400, **shipped)
-    make_run(tmp_path, seed=4, **{**shipped, "kappa": 3.0})  # not of the paper
+    make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2, steps=400)
+    make_run(tmp_path, seed=4, kappa=3.0)  # not of the paper
     broken = make_run(tmp_path, seed=3)
     (broken.path / "Hopper-v4" / "config.yml").write_text("lam: 0.9")  # no n_timesteps
     runs, unreadable = find_runs(tmp_path)
     page = report.write_report(runs, unreadable, tmp_path / "out").read_text()
-    assert "1 (1,000 steps), 1 unfinished" in page
+    assert "1 (1,000 steps), 1 not averaged" in page
     assert "400 of 1,000" in page
     assert "stopped early; the model was saved" in page
     assert str(broken.path) in page
@@ -280,6 +279,35 @@ def test_from_runs_to_a_page(logs, tmp_path, capsys):
     assert "All TDC: " in page  # the hyperparameters of this test
 
 
+def test_the_finished_runs_are_shown_where_those_as_shipped_are_not_finished(tmp_path):
+    make_run(tmp_path, steps=400)
+    make_run(tmp_path, lam=0.3)
+    make_run(tmp_path, algo="td3")
+    assert [group.label for group in curves.headline(read_groups(tmp_path))] == ["TDC", "TDC, λ 0.3", "TD3"]
+
+
+def test_runs_without_evaluations_have_no_figure(tmp_path):
+    run = make_run(tmp_path / "logs", env_id="Isaac-Repose-Cube-Allegro-v0")
+    (run.path / "evaluations.npz").unlink()
+    groups = read_groups(tmp_path / "logs")
+    assert sections.Report(groups, tmp_path).learning_curves().pictures == []
+    assert report.warnings(groups)[0].startswith("No run is finished and evaluated")
+
+
+def test_tasks_of_one_length_are_one_row(tmp_path):
+    def rows():
+        table = tables.make_published_table(tables.make_returns_table(read_groups(tmp_path)))
+        return table[table["Algorithm"] == "TDC: this report"][["Hopper", "Walker2d", "Steps"]].values.tolist()
+
+    for env_id, steps in (("Hopper-v4", 300_000), ("Walker2d-v4", 300_000)):
+        make_run(tmp_path, env_id=env_id, steps=steps, n_timesteps=steps, returns=((5.0,),))
+    assert rows() == [["5", "5", "300,000"]]
+    shutil.rmtree(tmp_path / "tdc")
+    for env_id, steps in (("Hopper-v4", 30_000), ("Walker2d-v4", 80_000)):  # 2 % of each
+        make_run(tmp_path, env_id=env_id, steps=steps, n_timesteps=steps, returns=((5.0,),))
+    assert rows() == [["5", "5", "– / 30,000 / 80,000 / – / –"]]
+
+
 def test_an_earlier_report_leaves_nothing(tmp_path):
     make_run(tmp_path / "one", lam=0.0, log={"train/td_error_var": [1.0]})
     make_run(tmp_path / "other", algo="td3")
@@ -294,12 +322,12 @@ def test_an_earlier_report_leaves_nothing(tmp_path):
 
 
 def test_seeds_of_several_commits_are_said(tmp_path):
-    for seed, commit in ((1, "aaaaaaaaaa"), (2, "bbbbbbbbbb")):
+    for seed, commit in ((1, "a" * 40), (2, f"{'b' * 40}, with uncommitted changes")):
         run = make_run(tmp_path, seed=seed)
-        (run.path / run.env_name / "versions.yml").write_text(f"sb3_tdc: {commit}\n")
+        (run.path / run.env_name / "versions.yml").write_text(f"mujoco: 3.4.0\nsb3_tdc: {commit}\n")
     page = report.write_report(*find_runs(tmp_path), tmp_path / "out").read_text()
     assert "Seeds of 1 group were trained by several commits of sb3_tdc (TDC on Hopper-v4, 1,000 steps)" in page
-    assert "aaaaaaa, bbbbbbb" in page
+    assert "aaaaaaa; bbbbbbb, with uncommitted changes" in page
 
 
 def test_the_steps_of_test_episodes_of_a_board_are_said(tmp_path):
@@ -308,7 +336,7 @@ def test_the_steps_of_test_episodes_of_a_board_are_said(tmp_path):
     said = [text for text in report.warnings(read_groups(tmp_path)) if "board" in text]
     assert len(said) == 1
     assert "ADVB_TD3 on Hopper-v4" in said[0]
-    assert "4,321 environment steps of test episodes" in said[0]
+    assert "took up to 4,321 further environment steps a run" in said[0]
 
 
 def test_results_and_logs_make_one_report(tmp_path, capsys):

@@ -10,13 +10,13 @@ from sb3_tdc.experiments import sections, statistics, tables
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.variants import compare_variants
-from tests.helpers.run_folders import HOPPER, make_run
+from tests.helpers.run_folders import make_run
 
 
 def make_runs(folder, late, algo="tdc", **config):
     """:param late: of each seed, both evaluations in the last third; the first one does not count"""
     for seed, (one, other) in enumerate(late, 1):
-        make_run(folder, algo, seed=seed, returns=((-999.0,), (-999.0,), (one,), (other,)), **{**HOPPER, **config})
+        make_run(folder, algo, seed=seed, returns=((-999.0,), (-999.0,), (one,), (other,)), **config)
 
 
 def compare(folder):

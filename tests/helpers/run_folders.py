@@ -6,18 +6,20 @@ import zipfile
 import numpy as np
 import pandas as pd
 
+from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.folder import RunFolder
 
 NETWORKS = {"net_arch": [256, 256], "n_quantiles": 64}
 
 
-HOPPER = {
-    "lam": 0.9,
-    "learning_rate": 2e-4,
-    "qf_learning_rate": 2e-4,
-    "policy_kwargs": NETWORKS,
-    "n_timesteps": 1000,
-}
+def shipped(algo="tdc", env_id="Hopper-v4", n_timesteps=1000):
+    """What ``hyperparams/`` has, shortened as the matrix does."""
+    try:
+        entry, _ = read_entry(hyperparams_file(algo), env_id)
+    except ValueError:  # of another package
+        entry = {}
+    short = {"learning_starts": min(entry["learning_starts"], n_timesteps // 10)} if "learning_starts" in entry else {}
+    return {**entry, **short, "n_timesteps": n_timesteps}
 
 
 def make_run(
@@ -25,7 +27,7 @@ def make_run(
 ):
     """:param steps: taken; None if no model was saved; :param log: columns of progress.csv, at equal distances"""
     run = RunFolder.create(folder, algo, env_id)
-    config = {**(HOPPER if algo == "tdc" else {"n_timesteps": 1000}), **config}
+    config = {**shipped(algo, env_id, config.get("n_timesteps", 1000)), **config}
     run.write_config(config, {"algo": algo, "env": env_id, "seed": seed, **dict(args)})
     timesteps = np.linspace(0, steps or 500, len(returns) + 1)[1:]
     np.savez(run.path / "evaluations.npz", timesteps=timesteps, results=returns)
