@@ -158,6 +158,9 @@ def parse(
     hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _NO_HYPERPARAMETERS}
     hints.update(_RUN_KEYS)
     replaced = {key: value for key, value in entry.items() if key not in overrides}
+    for mapping, place_of in ((replaced, where), (overrides, where_overrides)):
+        for key in (key for key in mapping if key in _FLAGS):
+            raise ValueError(f"{place_of}: {key} is not a hyperparameter; use {_FLAGS[key]}")
     limits = {**getattr(algorithm, "limits", OFF_POLICY_LIMITS), **_RUN_LIMITS}
     values = {
         **convert_mapping(replaced, hints, where, limits),
@@ -215,13 +218,15 @@ def convert_mapping(
 
     :param hints: the annotation of every key that is known
     :param where: for the error
-    :param limits: of numbers, also of those inside of a value
+    :param limits: of numbers, and of those within a value
     :raises ValueError: naming the key, what it was and what is allowed
     """
     converted = {}
     for key, value in mapping.items():
         if key not in hints:
-            raise ValueError(f"{where}: {_unknown_key(key, hints)}")
+            raise ValueError(
+                f"{where}: unknown key {key!r}{suggest(str(key), hints) or '; known: ' + ', '.join(hints)}"
+            )
         try:
             converted[key] = _convert(value, hints[key])
         except (TypeError, ValueError, OverflowError) as error:
@@ -231,12 +236,6 @@ def convert_mapping(
             for number in _numbers_in(converted[key]):
                 check_within(limits, key, number, f"{where}: {key}")
     return converted
-
-
-def _unknown_key(key: Any, known: Iterable[str]) -> str:
-    if key in _FLAGS:
-        return f"{key} is no hyperparameter: it has a flag, {_FLAGS[key]}"
-    return f"unknown key {key!r}{suggest(str(key), known) or '; known: ' + ', '.join(known)}"
 
 
 def _numbers_in(value: Any) -> Iterator[float]:

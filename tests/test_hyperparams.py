@@ -147,7 +147,8 @@ def test_values_become_what_the_constructor_wants():
     [
         ({"learning_rte": 1}, "file.yml, Env-v0: unknown key 'learning_rte'; did you mean 'learning_rate'?"),
         ({"Lam": 1}, "unknown key 'Lam'; did you mean 'lam'?"),
-        ({"seed": 1}, "file.yml, Env-v0: seed is no hyperparameter: it has a flag, --seed"),
+        ({"seed": 1}, "file.yml, Env-v0: seed is not a hyperparameter; use --seed"),
+        ({"policy_kwargs": {"device": "cpu"}}, "policy_kwargs: unknown key 'device'"),
         ({"zzz": 1}, "unknown key 'zzz'; known: policy, learning_rate, buffer_size, "),
         (
             {"normalize": {"foo": None}},

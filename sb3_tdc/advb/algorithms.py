@@ -1,5 +1,6 @@
 """TD3, SAC and TDC with an advisory board. No algorithm changes: only who decides about an action."""
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -9,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_tdc.advb import policies
-from sb3_tdc.common.checks import check_integer
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within
 from sb3_tdc.common.saved_fields import SavedField, integer
 from sb3_tdc.tdc import TDC
 
@@ -24,6 +25,7 @@ class Advised(OffPolicyAlgorithm):
     :param kwargs: those of the algorithm; ``policy_kwargs`` may hold ``n_members`` (10)
     """
 
+    limits: ClassVar[Limits] = {**OFF_POLICY_LIMITS, "formation_period": (0, math.inf), "n_members": (1, 256)}
     saved_fields: ClassVar[dict[str, SavedField]] = {
         "formation_period": SavedField(integer(0)),
         "policy_kwargs.n_members": SavedField(integer(1, 256), is_required=False),
@@ -34,8 +36,8 @@ class Advised(OffPolicyAlgorithm):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        self.formation_period = check_integer("formation_period", self.formation_period, 0)
-        check_integer("policy_kwargs['n_members']", self.policy_kwargs.get("n_members", 10), 1)
+        self.formation_period = int(check_within(self.limits, "formation_period", self.formation_period))
+        check_within(self.limits, "n_members", self.policy_kwargs.get("n_members", 10), "policy_kwargs['n_members']")
         super()._setup_model()
 
     def _sample_action(

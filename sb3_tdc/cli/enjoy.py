@@ -23,7 +23,7 @@ from sb3_tdc.common.threads import set_threads
 from sb3_tdc.common.words import count
 from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
-from sb3_tdc.envs.registry import import_packages, split_env_id
+from sb3_tdc.envs.registry import import_packages, is_of_mujoco, split_env_id
 from sb3_tdc.envs.rendering import (
     VIDEO_SUFFIXES,
     VideoWriter,
@@ -217,7 +217,7 @@ def _rendering(args: argparse.Namespace, env_id: str, env_kwargs: dict[str, Any]
         print("There is no display: no window. To see the agent: --record FILE.mp4")
         wanted = None
     drawn = needed or wanted
-    if drawn is not None and "mujoco" in str(gym.spec(env_id).entry_point):
+    if drawn is not None and is_of_mujoco(env_id):
         print(choose_gl_backend(drawn == "human"))
     return {} if needed is not None or drawn is None else {"render_mode": drawn}
 

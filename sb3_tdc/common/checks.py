@@ -10,8 +10,10 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-# The smallest and the largest number that an argument may be: of integers, if the smallest is one
+# The smallest and the largest number that an argument may be; integers where the smallest is an int
 Limits = Mapping[str, tuple[float, float]]
+# The smallest number above 0
+ABOVE_ZERO = math.nextafter(0.0, 1.0)
 _POSITIVE, _NOT_NEGATIVE = (1, math.inf), (0.0, math.inf)
 # Of the off-policy algorithms of SB3 and their policies
 OFF_POLICY_LIMITS: Limits = {
@@ -25,6 +27,8 @@ OFF_POLICY_LIMITS: Limits = {
 
 
 def _allowed(kind: str, minimum: float, maximum: float) -> str:
+    if minimum == ABOVE_ZERO:
+        return f"{kind} above 0" if maximum == math.inf else f"{kind} above 0, up to {maximum}"
     if maximum < math.inf:
         return f"{kind} between {minimum} and {maximum}"
     return f"{kind} of at least {minimum}" if minimum > -math.inf else kind
@@ -53,17 +57,17 @@ def check_number(name: str, value: Any, minimum: float = -math.inf, maximum: flo
     return number
 
 
-def check_integer(name: str, value: Any, minimum: int) -> int:
+def check_integer(name: str, value: Any, minimum: int, maximum: float = math.inf) -> int:
     """
     Check an integer.
 
-    :return: the value, an integer of at least ``minimum``; 1e6 is one, too
+    :return: the value, an integer in [minimum, maximum]; 1e6 is one, too
     :raises ValueError: if it is anything else
     """
     is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     number = value if is_integer else _as_number(value)
-    if not math.isfinite(number) or number != int(number) or number < minimum:
-        raise ValueError(f"{name} must be {_allowed('an integer', minimum, math.inf)}, got {value!r}")
+    if not math.isfinite(number) or number != int(number) or not minimum <= number <= maximum:
+        raise ValueError(f"{name} must be {_allowed('an integer', minimum, maximum)}, got {value!r}")
     return int(number)
 
 
@@ -78,7 +82,7 @@ def check_within(limits: Limits, name: str, value: Any, shown_as: str = "") -> f
     """
     minimum, maximum = limits[name]
     if isinstance(minimum, int):
-        return check_integer(shown_as or name, value, minimum)
+        return check_integer(shown_as or name, value, minimum, maximum)
     return check_number(shown_as or name, value, minimum, maximum)
 
 
@@ -134,22 +138,23 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
 
 
-def check_device(name: str, device: str) -> None:
+def check_device(name: str, device: str, remedy: str = "") -> None:
     """
-    Check that PyTorch can compute on a device; SB3 would compute on the CPU where there is no GPU.
+    Check that a device is there, if it is a CPU or a GPU; SB3 would compute on the CPU where there is no GPU.
 
     :param name: of the argument, for the error
+    :param remedy: the end of the sentence
     :raises ValueError: if there is no such device here, naming those that there are
     """
-    n_gpus, has_mps = th.cuda.device_count(), th.backends.mps.is_available()
-    gpus = ["cuda", *(f"cuda:{i}" for i in range(n_gpus))] if n_gpus else []
-    there = ["auto", "cpu", *gpus, *(["mps"] if has_mps else [])]
+    n_gpus = {"cpu": 1, "cuda": th.cuda.device_count(), "mps": int(th.backends.mps.is_available())}
     try:
-        kind = "auto" if device == "auto" else th.device(device).type
+        parsed = None if device == "auto" else th.device(device)
+        is_there = parsed is None or (parsed.index or 0) < n_gpus.get(parsed.type, math.inf)
     except RuntimeError:
-        kind = ""
-    if not kind or (kind in ("cuda", "mps") and device not in there):
-        raise ValueError(f"{name} must be one of {', '.join(there)} on this machine, got {device!r}")
+        is_there = False
+    if not is_there:
+        there = ["auto", "cpu", *(f"cuda:{i}" for i in range(n_gpus["cuda"])), *["mps"] * n_gpus["mps"]]
+        raise ValueError(f"{name} must be one of {', '.join(there)} on this machine, got {device!r}{remedy}")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

@@ -97,6 +97,15 @@ def lock(path: Path) -> Any:
     return file
 
 
+def unlock(file: Any) -> None:
+    """Let others lock a file, also where a forked process still has it open."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    fcntl.flock(file, fcntl.LOCK_UN)
+
+
 def is_file_at(file: Any, path: Path) -> bool:
     """Return whether an open file is still the one at a path."""
     return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())

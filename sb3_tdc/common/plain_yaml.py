@@ -11,6 +11,8 @@ from typing import Any
 
 import yaml
 
+from sb3_tdc.common.untrusted import escaped
+
 _FLOAT = "tag:yaml.org,2002:float"
 _MERGE = "tag:yaml.org,2002:merge"
 _PYTHON = "tag:yaml.org,2002:python"
@@ -38,7 +40,7 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
                 if (key.tag, key.value) in seen:
-                    raise yaml.YAMLError(f"line {key.start_mark.line + 1} gives {key.value} a second time")
+                    raise yaml.YAMLError(f"line {key.start_mark.line + 1} gives {escaped(key.value, 60)} a second time")
                 seen.add((key.tag, key.value))
         return node
 

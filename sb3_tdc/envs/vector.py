@@ -39,8 +39,8 @@ class GymnasiumVecEnv(VecEnv):
             raise ValueError(f"SB3 knows no Tuple observations, and {env} has them")
         self.env = env
         mode = env.metadata.get("autoreset_mode", "NextStep")  # Gymnasium 1.0 has no other, and does not say so
-        self.resets_itself = getattr(mode, "value", mode) == "SameStep"
-        self._resets_in_next_step = getattr(mode, "value", mode) == "NextStep"
+        name = getattr(mode, "value", mode)
+        self.resets_itself, self._resets_in_next_step = name == "SameStep", name == "NextStep"
         if isinstance(env.unwrapped, AsyncVectorEnv) and not env.unwrapped.shared_memory and mode is not _SAME_STEP:
             # Its processes would reset once more in the next step (Gymnasium 1.4)
             raise ValueError(f"{env} without shared memory resets twice: {_REMEDY}")

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update, update_learning_rate
 from torch import nn
 
-from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
+from sb3_tdc.common.checks import ABOVE_ZERO, OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, integer, number
 from sb3_tdc.meow.policies import CnnPolicy, MEOWPolicy, MlpPolicy, MultiInputPolicy
@@ -65,7 +65,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
     limits: ClassVar[Limits] = {
         **OFF_POLICY_LIMITS,
         **dict.fromkeys(("shift_arch", "n_shifts", "n_blocks"), (1, math.inf)),
-        "max_grad_norm": (0.0, math.inf),
+        **dict.fromkeys(("ent_coef", "max_grad_norm"), (ABOVE_ZERO, math.inf)),
         "dropout": (0.0, 1.0),
     }
     saved_fields: ClassVar[dict[str, SavedField]] = {
@@ -141,8 +141,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        for name in ("ent_coef", "max_grad_norm"):
-            setattr(self, name, _check_positive(name, getattr(self, name)))
+        self._check_limits("ent_coef", "max_grad_norm")
         arguments = self.policy_kwargs
         for name in ("n_shifts", "n_blocks", "dropout"):
             check_within(self.limits, name, arguments.get(name, 1), f"policy_kwargs[{name!r}]")
@@ -168,7 +167,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         :raises ValueError: if a schedule returns something that is not allowed
         :raises NonFiniteError: if the loss has been seen to be NaN or infinite
         """
-        ent_coef = _check_positive("ent_coef", self.ent_coef)
+        ent_coef = check_within(self.limits, "ent_coef", self.ent_coef)
         self.policy.set_training_mode(True)
         update_learning_rate(self.policy.optimizer, self.scheduled("learning_rate"))
 
@@ -229,10 +228,3 @@ class MEOW(CheckedOffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
-
-
-def _check_positive(name: str, value: Any) -> float:
-    number = check_number(name, value, 0.0)
-    if number == 0:
-        raise ValueError(f"{name} must be a positive number, got {value!r}")
-    return number

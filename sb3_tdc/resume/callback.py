@@ -26,7 +26,7 @@ from sb3_tdc.resume.store import Store, Stored
 from sb3_tdc.resume.walk import Initial, NotRestoredError
 
 DEFAULT_FREQ = 10_000
-# How a sentence begins that is about one of several environments
+# The beginning of a sentence about one of several environments
 _ENVIRONMENT = re.compile(r".*?, environment \d+(?=: )")
 # The older state that stays is between this and twice this many times ``freq`` steps older than the newest
 _OLDER = 10
@@ -125,6 +125,7 @@ class ResumeStates(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.root = self.locals["callback"]
+        self.store.open_again()  # before anything of another's is removed or put back
         if self._to_restore is None:
             newest = max(self.store.steps(), default=None)
             if newest is not None and newest != self.last_step:

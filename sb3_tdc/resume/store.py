@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
-from sb3_tdc.common.files import is_file_at, lock
+from sb3_tdc.common.files import is_file_at, lock, unlock
 
 Writer = Callable[[Path], Any]
 
@@ -79,32 +79,36 @@ class Store:
 
     def __init__(self, folder: Path, keep: int, span: int):
         self.folder, self.keep, self.span = folder, keep, span
-        (folder / _SHARED).mkdir(parents=True, exist_ok=True)
+        # Outside the folder: removing the states must not let a second process in
+        self._lock_file = folder.with_name(f"{folder.name}.lock")
+        self._lock: Any = None
         earlier = _OPEN.get(folder.resolve())
         if earlier is not None:
             earlier.close()
-        # Outside the folder: removing the states must not let a second process in
-        self._lock_file = folder.with_name(f"{folder.name}.lock")
-        self._lock = _lock(self._lock_file)
-        _OPEN[folder.resolve()] = self
+        self.open_again()
 
     def close(self) -> None:
         """Let others write there, until this one writes again."""
-        self._lock.close()
+        if self._lock is not None:
+            if self._owner == os.getpid():  # not a fork of it, which shares the lock
+                unlock(self._lock)
+            self._lock.close()
+            self._lock = None
 
-    def open_again(self, shared: Iterable[str]) -> bool:
+    def open_again(self, shared: Iterable[str] = ()) -> bool:
         """
         Make the folder, and take the lock, again if they have been removed, or the store has been closed.
 
         :param shared: names of shared files
         :return: whether these are still there
-        :raises LockedError: if another process writes there by now
+        :raises LockedError: if another process writes there by now, or a newer store of this one
         """
         (self.folder / _SHARED).mkdir(parents=True, exist_ok=True)
-        if self._lock.closed or not is_file_at(self._lock, self._lock_file):
+        if self._lock is None or not is_file_at(self._lock, self._lock_file):
             locked = _lock(self._lock_file)
-            self._lock.close()
-            self._lock = locked
+            self.close()
+            self._lock, self._owner = locked, os.getpid()
+            _OPEN[self.folder.resolve()] = self
         return all((self.folder / _SHARED / name).is_file() for name in shared)
 
     def steps(self) -> list[int]:
@@ -236,7 +240,12 @@ class Store:
                 path.unlink(missing_ok=True)
 
     def clear(self) -> None:
-        """Remove all states."""
+        """
+        Remove all states.
+
+        :raises LockedError: if another process writes there by now, or a newer store of this one
+        """
+        self.open_again()
         for step in self.steps()[::-1]:
             self._remove(step)
 
@@ -298,5 +307,5 @@ def _sync_folder(path: Path) -> None:
 def _lock(path: Path) -> Any:
     file = lock(path)
     if file is None:
-        raise LockedError(f"Another process, or another ResumeStates of this one, writes to {path.parent}")
+        raise LockedError(f"Another process, or a newer ResumeStates in this process, writes to {path.parent}")
     return file

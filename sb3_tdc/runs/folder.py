@@ -31,7 +31,7 @@ class RunFolder:
 
     :param path: ``<log folder>/<algo>/<environment>_<number>``
     :param env_name: the environment's id, without slashes
-    :param outermost: of the folders that were made for it; None if it was there already
+    :param outermost: of the folders that were made for it; None if it was opened
     """
 
     path: Path
@@ -53,7 +53,7 @@ class RunFolder:
 
     def remove(self) -> None:
         """Remove the folder of a run that never began, and those that were made for it, unless others use them."""
-        shutil.rmtree(self.path)
+        shutil.rmtree(self.path, ignore_errors=True)
         made = (each for each in self.path.parents if self.outermost and each.is_relative_to(self.outermost))
         with suppress(OSError):  # one that is not empty
             for parent in made:

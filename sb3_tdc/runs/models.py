@@ -36,7 +36,7 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
     space = env.observation_space
     if hyperparams.model["policy"] == "MultiInputPolicy" and not isinstance(space, spaces.Dict):
         raise ValueError(
-            f"policy MultiInputPolicy is for Dict observations, got {space}: policy:MlpPolicy or CnnPolicy"
+            f"policy MultiInputPolicy is for Dict observations, got {space}: use policy:MlpPolicy or policy:CnnPolicy"
         )
     with _enough_memory(hyperparams):
         return ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
@@ -48,7 +48,9 @@ def _enough_memory(hyperparams: Hyperparams) -> Iterator[None]:
         yield
     except MemoryError as error:
         size = hyperparams.model.get("buffer_size", "that of the algorithm")
-        raise ValueError(f"The memory is too small for the replay buffer (buffer_size {size}): {error}") from error
+        raise ValueError(
+            f"The memory is too small for the model or its replay buffer (buffer_size {size}): {error}"
+        ) from error
 
 
 def continue_model(

@@ -45,7 +45,7 @@ def setting(  # type: ignore[no-untyped-def]
     :param flags: on the command line; the name of the setting is the first by default
     :param minimum: the smallest number allowed
     :param maximum: the largest
-    :param minus_one: what -1 means, which is allowed too then
+    :param minus_one: what -1 means; None if it is not allowed
     :param parsing: further keyword arguments of ``add_argument``
     :return: a field of a dataclass
     """
@@ -99,15 +99,15 @@ class RunSettings:
     trust: bool = setting(default=False, help="let the files of -i run code, as SB3 does")
     eval_freq: int = setting(
         default=20_000,
-        minimum=1,
-        minus_one="none",
+        minimum=0,
+        minus_one="none, as 0",
         role=Role.EXPERIMENT,
         help="environment steps between evaluations",
     )
     eval_episodes: int = setting(default=5, minimum=1, role=Role.EXPERIMENT, help="episodes per evaluation")
     n_eval_envs: int = setting(default=1, minimum=1, help="environments for evaluation")
     save_freq: int = setting(
-        default=-1, minimum=1, minus_one="only at the end", help="environment steps between saved models"
+        default=-1, minimum=0, minus_one="only at the end, as 0", help="environment steps between saved models"
     )
     save_replay_buffer: bool = setting(default=False, help="save the replay buffer with the model")
     resume_freq: int | None = setting(
@@ -195,7 +195,7 @@ def check_settings(settings: RunSettings, stored_in: str = "", given: Collection
             raise ValueError(f"{shown_as} must be one of {', '.join(known)}, got {value!r}")
         _check_number(each, value, shown_as)
         if each.name == "device":
-            check_device(shown_as, value)
+            check_device(shown_as, value, "; --device takes another" if stored_in and each.name not in given else "")
 
 
 def _check_number(declared: Field, value: Any, shown_as: str) -> None:

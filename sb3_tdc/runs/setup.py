@@ -2,7 +2,6 @@
 
 import shutil
 import textwrap
-from contextlib import suppress
 from dataclasses import fields
 from os.path import abspath
 from pathlib import Path
@@ -18,7 +17,7 @@ from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, flags_of, plain_arguments
+from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, default_of, flags_of, plain_arguments
 from sb3_tdc.runs.training import TrainingRun
 from sb3_tdc.safe_load.run_files import check_arguments
 
@@ -89,8 +88,7 @@ def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
             shutil.copyfile(settings.trained_agent, folder.trained_agent)
     except OSError as error:
         if folder is not None:
-            with suppress(OSError):
-                folder.remove()
+            folder.remove()
         raise ValueError(f"No run folder can be made in {settings.log_folder}: {error}") from error
     return folder
 
@@ -144,9 +142,9 @@ def _resumed_settings(folder: RunFolder, given: dict[str, Any]) -> RunSettings:
         name, flag = declared.name, flags_of(declared)[-1]
         if name in given and declared.metadata["role"] in (Role.PROCESS, Role.RESUMING):
             now[name] = given[name]
-        elif name in given and given[name] != stored.get(name, given[name]):
-            value, before = (plain_arguments(each)[name] for each in (given, stored))
-            raise ValueError(f"{flag} {value} contradicts the run in {folder.path}: {flag} {before}")
+        elif name in given and given[name] != (before := stored.get(name, default_of(declared))):
+            said = plain_arguments({"given": given[name], "before": before})
+            raise ValueError(f"{flag} {said['given']} contradicts the run in {folder.path}: {flag} {said['before']}")
     fresh = {"resume": None, "from_step": None, "start_over": False}
     settings = RunSettings(**{**stored, **fresh, **now})
     check_settings(settings, where, now)

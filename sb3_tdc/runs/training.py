@@ -18,6 +18,7 @@ from stable_baselines3.common.logger import (
     TensorBoardOutputFormat,
 )
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.advb import BoardCallback
@@ -131,14 +132,16 @@ def train(run: TrainingRun) -> TrainingOutcome:
             if states is not None:
                 stack.callback(states.store.close)
             model = _make_model(run, stack.enter_context(closing_envs(_make_training_envs(run))))
-            model.set_logger(_make_logger(run))
-            stack.callback(model.logger.close)
             stop = StopOnSignal(states)
             callbacks = _make_callbacks(run, model, stop, states, stack)
             if states is not None:
                 _select_state(run, states, model)
+            model.set_logger(_make_logger(run))
+            stack.callback(model.logger.close)
         if run.settings.verbose > 0:
-            _announce(run, model)
+            _announce(run)
+        if not run.has_state:
+            _warn_of_no_update(model, run.hyperparams.n_timesteps)
         with stop, divergence_named(model):
             _learn(run, model, callbacks)
             _save(run, model)
@@ -160,20 +163,30 @@ def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
             run.folder.remove()
         if not isinstance(error, (Exception, KeyboardInterrupt)):
             raise
+        if run.settings.verbose > 1:
+            traceback.print_exc()
         # Others are of wrappers, policies and callbacks that the user has written: with their place
         is_a_sentence = isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt))
         reason = " ".join(str(error).split()) if is_a_sentence else describe_exception(error)
         raise SetupError(reason or "Interrupted before training began") from error
 
 
-def _announce(run: TrainingRun, model: OffPolicyAlgorithm) -> None:
-    settings, n_timesteps = run.settings, run.hyperparams.n_timesteps
-    verb = "Resuming" if run.is_resumed else "Training"
+def _announce(run: TrainingRun) -> None:
+    verb, settings = "Resuming" if run.is_resumed else "Training", run.settings
     print(f"{verb} {settings.algo} on {settings.env}, seed {settings.seed}, in {run.folder.path}", flush=True)
-    if model.learning_starts >= n_timesteps:
+
+
+def _warn_of_no_update(model: OffPolicyAlgorithm, n_timesteps: int) -> None:
+    """Warn of a run that ends before its first update; one of whole episodes takes a number of steps not yet known."""
+    assert isinstance(model.train_freq, TrainFreq)
+    if model.train_freq.unit is TrainFrequencyUnit.EPISODE:
+        return
+    of_rollout = model.train_freq.frequency * model.n_envs
+    last_step = -(-n_timesteps // of_rollout) * of_rollout
+    if last_step <= model.learning_starts:
         print(
-            f"Warning: nothing will be learned, as learning_starts, {model.learning_starts:,}, is not below the "
-            f"{n_timesteps:,} steps of this run: add -params learning_starts:…, or more steps by -n",
+            f"Warning: nothing will be learned: learning_starts ({model.learning_starts:,}) is not below the run's "
+            f"{last_step:,} steps. Lower it by -params learning_starts:…, or take more steps by -n",
             file=sys.stderr,
         )
 

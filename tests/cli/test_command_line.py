@@ -201,11 +201,16 @@ def test_a_log_of_nothing(tmp_path):
     assert run_train(tmp_path, "--log-interval", 0) == 0
 
 
-@pytest.mark.parametrize(("learning_starts", "n_updates"), [(120, 0), (119, 1)])
-def test_a_run_that_learns_nothing_says_so(tmp_path, learning_starts, n_updates, capsys):
-    assert run_train(tmp_path, n=120, small=[*SMALL, f"learning_starts:{learning_starts}"]) == 0
-    assert TDC.load(tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip")._n_updates == n_updates
-    warned = "Warning: nothing will be learned, as learning_starts, 120, is not below the 120 steps of this run"
+@pytest.mark.parametrize(
+    ("learning_starts", "train_freq", "n_updates"),
+    [(120, 1, 0), (119, 1, 1), (120, 50, 1), (150, 50, 0), (10, "[1, episode]", 1)],  # 120 steps end after 150
+)
+def test_a_run_that_learns_nothing_says_so(tmp_path, learning_starts, train_freq, n_updates, capsys):
+    small = [*SMALL, f"learning_starts:{learning_starts}", f"train_freq:{train_freq}", "gradient_steps:1"]
+    assert run_train(tmp_path, n=120, small=small) == 0
+    updates = TDC.load(tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip")._n_updates
+    assert bool(updates) == bool(n_updates)
+    warned = f"Warning: nothing will be learned: learning_starts ({learning_starts}) is not below the run's"
     assert (warned in capsys.readouterr().err) == (n_updates == 0)
 
 

@@ -52,6 +52,8 @@ def test_what_is_written_is_read(value):
 def test_a_key_that_is_given_twice_is_refused_with_its_line():
     with pytest.raises(ValueError, match=r"my.yml is not YAML of plain values: line 3 gives lam a second time"):
         plain_yaml.load("A-v0:\n  lam: 1\n  lam: 2", "my.yml")
+    with pytest.raises(ValueError, match=r"gives \\x1b\[31m a second time"):  # and no terminal is driven by it
+        plain_yaml.load('"\\e[31m": 1\n"\\e[31m": 2', "my.yml")
     # What is merged is overruled, not given twice, also where a mapping that merges is merged
     text = "a: &a {x: 1, y: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: *b, x: 3, 1: 4, '1': 5}"
     assert plain_yaml.load(text, "")["c"] == {"x": 3, "y": 1, 1: 4, "1": 5}

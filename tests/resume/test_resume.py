@@ -25,7 +25,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_tdc import TDC
-from sb3_tdc.resume import Restorable, ResumeStates, callback
+from sb3_tdc.resume import LockedError, Restorable, ResumeStates, callback, stored_steps
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.runs.callbacks import busy_machine
 from sb3_tdc.runs.callbacks import stopping as interruption
@@ -127,6 +127,8 @@ def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
         (["--seed", "3"], f"--seed 3 contradicts the run in {stopped}: --seed 1"),
         (["--algo", "sac"], "--algo sac contradicts the run in"),
         (["-n", "500"], "--n-timesteps 500 contradicts the run in"),
+        (["-i", "other.zip"], "other.zip contradicts the run in"),
+        (["--preset", "parallel"], "--preset parallel contradicts the run in"),
         (["-params", "buffer_size:5"], "buffer_size cannot be changed when a run is resumed; learning_rate, "),
         (["-params", "lamb:0.5"], "command line (-params): unknown key 'lamb'; did you mean 'lam'?"),
         (["--from", "100"], "has no state of step 100; there are: 270, 269, "),
@@ -237,6 +239,19 @@ def test_a_state_of_another_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="has states of a run already: call select"):
         model.learn(10, callback=states)
     states.store.close()
+
+
+def test_an_older_callback_removes_nothing_of_a_newer_one(tmp_path):
+    learn(make_model(), tmp_path, stop_at=70)
+    steps = stored_steps(tmp_path)
+    assert len(steps) > 1
+    model, older = make_model(), ResumeStates(tmp_path, verbose=0)
+    older.select(model, step=steps[-1])
+    newer = ResumeStates(tmp_path, verbose=0)
+    with pytest.raises(LockedError):
+        model.learn(150, callback=older)
+    assert stored_steps(tmp_path) == steps
+    newer.store.close()
 
 
 def test_other_callbacks_are_noticed(tmp_path):

@@ -2,8 +2,10 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
+import time
 import warnings
 
 import pytest
@@ -138,9 +140,8 @@ def test_one_process_at_a_time(store):
     def open_elsewhere():
         return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
 
-    assert f"Another process, or another ResumeStates of this one, writes to {store.folder.parent}" in (
-        open_elsewhere().stderr
-    )
+    sentence = f"Another process, or a newer ResumeStates in this process, writes to {store.folder.parent}"
+    assert sentence in open_elsewhere().stderr
     store.close()
     assert open_elsewhere().returncode == 0
 
@@ -150,11 +151,30 @@ def test_in_one_process_the_newest_has_the_folder(store):
     write(store, 1)
     second = Store(store.folder, 2, 0)
     write(second, 2)
-    with pytest.raises(LockedError, match="another ResumeStates of this one"):
-        store.open_again([])
+    with pytest.raises(LockedError, match="a newer ResumeStates in this process"):
+        store.open_again()
+    with pytest.raises(LockedError):
+        store.remove_all()
+    assert second.steps() == [2, 1]
     second.close()
     assert store.open_again(["ring_2"])  # the first may go on as soon as the second is done
     assert store.newest().step == 2
+    third = Store(store.folder, 2, 0)  # of those that are open, the first had it last
+    with pytest.raises(LockedError):
+        store.open_again()
+    third.close()
+
+
+def test_a_forked_process_does_not_keep_the_lock(store):
+    child = os.fork()
+    if not child:
+        time.sleep(30)
+        os._exit(0)
+    try:
+        Store(store.folder, 2, 0).close()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
 
 
 def test_there_is_always_an_older_one_to_go_back_to(tmp_path):
