@@ -96,6 +96,7 @@ class AdvBTDC(Advised, TDC):
         "CnnPolicy": policies.TDCCnnPolicy,
         "MultiInputPolicy": policies.TDCMultiInputPolicy,
     }
+    limits: ClassVar[Limits] = {**TDC.limits, **Advised.limits}
 
     def _check_arguments(self) -> None:
         super()._check_arguments()

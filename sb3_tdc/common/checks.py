@@ -153,7 +153,8 @@ def check_device(name: str, device: str, remedy: str = "") -> None:
     except RuntimeError:
         is_there = False
     if not is_there:
-        there = ["auto", "cpu", *(f"cuda:{i}" for i in range(n_gpus["cuda"])), *["mps"] * n_gpus["mps"]]
+        gpus = ["cuda", *(f"cuda:{i}" for i in range(n_gpus["cuda"]))] if n_gpus["cuda"] else []
+        there = ["auto", "cpu", *gpus, *["mps"] * n_gpus["mps"]]
         raise ValueError(f"{name} must be one of {', '.join(there)} on this machine, got {device!r}{remedy}")
 
 

@@ -385,7 +385,7 @@ def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
             ["-params", "policy:MultiInputPolicy"],
             "policy MultiInputPolicy is for Dict observations, got Box(-inf, inf, ",
         ),
-        (["-params", f"buffer_size:{10**14}"], f"too small for the replay buffer (buffer_size {10**14}): Unable to "),
+        (["-params", f"buffer_size:{10**14}"], f"its replay buffer (buffer_size {10**14}): Unable to "),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

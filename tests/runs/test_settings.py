@@ -14,9 +14,8 @@ from tests.helpers.training import fails
 @pytest.mark.parametrize(
     ("flag", "value", "allowed"),
     [
-        ("--eval-freq", 0, "at least 1 (or -1: none)"),
-        ("--eval-freq", -2, "at least 1 (or -1: none)"),
-        ("--save-freq", 0, "at least 1 (or -1: only at the end)"),
+        ("--eval-freq", -2, "at least 0 (or -1: none, as 0)"),
+        ("--save-freq", -5, "at least 0 (or -1: only at the end, as 0)"),
         ("--resume-freq", 0, "at least 1 (or -1: none)"),
         ("--log-interval", -2, "at least 0 (or -1: 4)"),
         ("--num-threads", 0, "at least 1 (or -1: at most two)"),
@@ -34,6 +33,7 @@ def test_numbers_that_mean_nothing_are_refused(tmp_path, capsys, flag, value, al
 def test_what_turns_something_off_is_allowed():
     """RL Zoo's convention."""
     check_settings(RunSettings(eval_freq=-1, save_freq=-1, resume_freq=-1, log_interval=0, num_threads=-1, seed=-1))
+    check_settings(RunSettings(eval_freq=0, save_freq=0))
     assert RunSettings(resume_freq=-1).writes_states is False
     assert RunSettings().writes_states is True
 
@@ -65,7 +65,7 @@ def run(tmp_path):
     ("edit", "sentence"),
     [
         ({"eval_freq": "often"}, "eval_freq must be an integer, got 'often'"),
-        ({"eval_freq": 0}, "eval_freq must be at least 1 (or -1: none), got 0"),
+        ({"eval_freq": -3}, "eval_freq must be at least 0 (or -1: none, as 0), got -3"),
         ({"eval_freq": 1.5}, "eval_freq must be an integer, got 1.5"),
         ({"resume_freq": "x"}, "resume_freq must be an integer or null, got 'x'"),
         ({"vec_env": "threads"}, "vec_env must be one of dummy, subproc, gymnasium, got 'threads'"),
