@@ -85,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = make_parser()
     args = parser.parse_args(argv)
     try:
-        plan = _plan(args)
-        plan = _without_published(plan, args)
+        whole = _plan(args)
+        plan = _without_published(whole, args)
         to_run = [job for job in plan.jobs if not job.is_finished]
         _describe(args, plan)
         if args.dry_run:
@@ -105,6 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if outcome.stopped:
         print("To continue: the same command", file=sys.stderr)
         return 130
+    published = [args.results] if len(plan.jobs) < len(whole.jobs) else []
     for folder in dict.fromkeys(args.logs / job.logs.relative_to(args.logs.resolve()).parts[0] for job in plan.jobs):
-        print(f"To look at them: {command('report', folder)}")
+        print(f"To look at them: {command('report', *published, folder)}")
     return int(bool(outcome.failed))

@@ -2,6 +2,8 @@
 
 import shutil
 import zipfile
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,6 +74,11 @@ def test_the_matrix_skips_what_is_published(logs, tmp_path, monkeypatch, capsys)
     assert f"1 of 2 runs are in {tmp_path / 'results'}" in out
     assert "1 of 1 to run" in out
     assert "seed 4" in out
+    monkeypatch.setattr(matrix, "cluster", lambda *args: nullcontext())
+    monkeypatch.setattr(matrix, "run_jobs", lambda *args: SimpleNamespace(failed=[], stopped=False))
+    assert matrix.main(command) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("To look at them: ")]
+    assert line.endswith(f" report {tmp_path / 'results'} {tmp_path / 'logs' / 'steps_600'}")
 
 
 def test_unfinished_runs_are_not_published(logs, tmp_path, capsys):
