@@ -250,7 +250,7 @@ def test_no_second_process_writes_a_run_whose_states_were_removed(tmp_path, at_s
     at_step(270, remove_then_resume)
     assert run_train(tmp_path) == 0
     assert errors[0].returncode == 2
-    assert "Another process, or another ResumeStates of this one, writes to" in errors[0].stderr
+    assert "Another process, or a newer ResumeStates in this process, writes to" in errors[0].stderr
 
 
 def test_a_run_whose_lock_another_process_has_taken_stops_with_a_sentence(tmp_path, at_step, capsys):
@@ -264,7 +264,7 @@ def test_a_run_whose_lock_another_process_has_taken_stops_with_a_sentence(tmp_pa
     assert run_train(tmp_path) == 1
     others[0].store.close()
     error = capsys.readouterr().err
-    assert "Another process, or another ResumeStates of this one, writes to" in error
+    assert "Another process, or a newer ResumeStates in this process, writes to" in error
     assert "Traceback" not in error
 
 
