@@ -32,7 +32,6 @@ from sb3_tdc.resume import Restorable, ResumeStates
 from sb3_tdc.tdc import calibration
 
 STEPS = 300
-calibration.PERIOD = 20  # so that λ moves in so few steps
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
 # On the wall clock
 _TIMES = ("t", "time/fps", "time/time_elapsed", "time/critics_elapsed")
@@ -382,4 +381,5 @@ def main(mode: str, folder: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    calibration.PERIOD = 20  # so that λ moves in so few steps
     main(sys.argv[1], Path(sys.argv[2]), sys.argv[3:])
