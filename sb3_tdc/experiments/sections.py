@@ -194,7 +194,9 @@ class Report:
             "lambda",
             tables.make_lam_table(self.groups),
             "What λ does, in the last third of the runs: means over seeds ± standard deviation. With λ = 0 nothing "
-            "is changed, by definition. Overestimation is what the critics predict minus the return that follows.",
+            "is changed, by definition. λ* is the least λ that would change a choice, where there is one. "
+            "Overestimation is what the critics predict minus the return that follows; scatter is that of returns "
+            "about their best line in the prediction.",
         )
         self.add_table(
             section,

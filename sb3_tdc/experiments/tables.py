@@ -158,12 +158,15 @@ def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
 # What λ does: a column of the log, its title, and by what it is multiplied to be read
 _LAM_COLUMNS = (
     ("train/lam", "λ", 1),
+    ("train/lam_can_change", "λ* exists, %", 100),
+    ("train/lam_critical_q50", "Median λ*", 1),
     ("train/lam_changes", "Choices changed, %", 100),
     ("train/lam_adds_in_std", "Adds to the target, σ", 1),
     ("train/lowered", "Lowers the target by", 1),
     ("train/kappa", "κ", 1),
     ("eval/overestimation", "Overestimation", 1),
     ("eval/std_error_correlation", "Correlation of σ and error", 1),
+    ("eval/std_scatter_correlation", "of σ and scatter", 1),
     ("train/actor_dormant", "Dormant units of the actor, %", 100),
     ("train/critic_dormant", "of the critics, %", 100),
 )
