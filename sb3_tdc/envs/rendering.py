@@ -1,6 +1,7 @@
 """Pictures without a display: which OpenGL backend MuJoCo can use, and video files."""
 
 import inspect
+import itertools
 import os
 import subprocess
 import sys
@@ -120,15 +121,23 @@ class VideoWriter:
             import imageio_ffmpeg  # noqa: F401
         except ImportError as error:
             raise ImportError('Recording needs imageio and ffmpeg: pip install "sb3-tdc[video]"') from error
-        self.writer: Any = imageio.get_writer(path, fps=fps)
+        self.every = 1
+        timing: Any = {"fps": fps}
+        if path.suffix.lower() == ".gif":
+            self.every, delay = _timing_of_gif(fps)
+            timing = {"duration": 10 * delay}  # milliseconds
+        self.writer: Any = imageio.get_writer(path, **timing)
+        self.n_frames = 0
 
     def add(self, frame: np.ndarray) -> None:
         """
-        Write a frame.
+        Write a frame, if there are not too many of them for the format.
 
         :param frame: (height, width, 3), uint8
         """
-        self.writer.append_data(frame)
+        if self.n_frames % self.every == 0:
+            self.writer.append_data(frame)
+        self.n_frames += 1
 
     def __enter__(self) -> "VideoWriter":
         return self
@@ -137,3 +146,14 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.writer.close()
+
+
+def _timing_of_gif(fps: float) -> tuple[int, int]:
+    """
+    Return how often a frame is shown, and for how many hundredths of a second: so that time runs as in the simulation.
+
+    A GIF counts in hundredths, and players slow down frames of less than two.
+    """
+    delays = (100 * every / fps for every in itertools.count(1))
+    every, delay = next((n, d) for n, d in enumerate(delays, 1) if d >= 2 and abs(round(d) - d) <= 0.1 * d)
+    return every, round(delay)

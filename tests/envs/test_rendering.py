@@ -10,6 +10,7 @@ import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs import rendering
@@ -165,6 +166,18 @@ def test_a_format_that_is_offered_can_be_written(tmp_path, suffix):
     frames = list(imageio.get_reader(path).iter_data())
     assert len(frames) == 5
     assert frames[4].mean() == pytest.approx(200, abs=5)
+
+
+@pytest.mark.parametrize("fps", [10, 20, 24, 30, 50, 60, 67, 100, 125, 240, 1000])
+def test_a_gif_runs_as_fast_as_the_simulation(tmp_path, fps):
+    path, seconds = tmp_path / "video.gif", 2
+    with rendering.VideoWriter(path, fps) as video:
+        for i in range(fps * seconds):
+            video.add(np.full((8, 8, 3), i % 251, np.uint8))
+    with Image.open(path) as gif:
+        delays = [frame.info["duration"] for frame in ImageSequence.Iterator(gif)]
+    assert min(delays) >= 20  # players slow down what is shorter
+    assert sum(delays) / 1000 == pytest.approx(seconds, rel=0.11, abs=0.1)
 
 
 def test_what_does_not_draw_cannot_be_recorded_and_says_so(runs, tmp_path, capsys):
