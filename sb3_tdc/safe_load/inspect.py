@@ -6,15 +6,17 @@ import mmap
 import warnings
 import zipfile
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
-from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES, foreign_names, parse_data
+from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES, foreign_names, parse_data, read_fields
 from sb3_tdc.safe_load.inert_pickle import Call, names_in, read_pickle
 from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, pickled_name
 from sb3_tdc.safe_load.models import load_safely
@@ -46,10 +48,34 @@ def inspect(path: Path) -> tuple[list[str], bool]:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            model = load_safely(path, device="cpu", buffer_size=1)
+            model = load_safely(path, _stand_in(path, size), device="cpu", buffer_size=1)
     except ValueError as error:
         return [*lines, f"Refused: {escaped(str(error).removeprefix(f'{path} was not opened: '))}"], False
     return [*lines, f"Would be opened as a {type(model).__name__} of {model.num_timesteps:,} steps."], True
+
+
+class _StandIn(gym.Env):
+    """An environment that is never stepped. :param fields: of a model, with its spaces"""
+
+    def __init__(self, fields: dict[str, Any]):
+        self.observation_space, self.action_space = fields["observation_space"], fields["action_space"]
+
+
+def _stand_in(path: Path, size: int) -> VecEnv | None:
+    """
+    Return what a model with a hindsight buffer needs of its environment to be opened; None for all others.
+
+    :raises ValueError: if the model is refused
+    """
+    with reading(f"{path} was not opened"):
+        budget = Budget(size)
+        with open_regular(path, MAX_BYTES) as (file, _):
+            entries = read_archive(file, MODEL_ENTRIES, budget)
+        if "data" not in entries:
+            return None
+        fields, _ = read_fields(entries["data"], {}, budget)
+    is_of_hindsight = fields.get("replay_buffer_class") is HerReplayBuffer
+    return DummyVecEnv([lambda: _StandIn(fields)]) if is_of_hindsight and "action_space" in fields else None
 
 
 def _describe_model(path: Path, size: int) -> list[str]:

@@ -760,6 +760,15 @@ def test_a_file_can_be_inspected(saved, tmp_path, marker, capsys):
     assert not marker.exists()
 
 
+def test_a_model_with_a_hindsight_buffer_can_be_inspected(tmp_path, marker, capsys):
+    TDC("MultiInputPolicy", goal_env(), **HER, **TINY).learn(40).save(tmp_path / "model.zip")
+    status, out = inspected(tmp_path / "model.zip", capsys)
+    assert (status, out.splitlines()[-1]) == (0, "Would be opened as a TDC of 40 steps.")
+    path = with_fields(tmp_path / "model.zip", tmp_path / "x.zip", replay_buffer_kwargs=serialized(Poison()))
+    status, out = inspected(path, capsys)
+    assert (status, "Refused: the field replay_buffer_kwargs" in out, marker.exists()) == (1, True, False)
+
+
 def test_statistics_buffers_and_folders_can_be_inspected(run, tmp_path, marker, capsys):
     assert inspected(run, capsys)[0] == 0
     (tmp_path / "stats.pkl").write_bytes(pickle.dumps(frames()))
