@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -211,10 +212,11 @@ def hyperparameters_not_shipped(run: Run) -> dict[str, Any]:
 
 def differences(run: Run) -> dict[str, Any]:
     """Return the settings that are not those of this package's ``hyperparams/``, as they are in the run."""
-    shipped = {**default_settings(run.algo), **_shipped(run.algo, run.env_id)}
+    entry = _shipped(run.algo, run.env_id)
+    shipped = {**default_settings(run.algo), **entry}
     return {
         key: run.setting(key)
-        for key in {**_shipped(run.algo, run.env_id), **run.settings}
+        for key in {**entry, **run.settings}
         if not same_settings(run.setting(key), shipped.get(key))
     }
 
@@ -255,7 +257,8 @@ def _describe(key: str, value: Any) -> str:
     return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
 
 
-def _shipped(algo: str, env_id: str) -> dict[str, Any]:
+@cache  # a report asks hundreds of times
+def _shipped(algo: str, env_id: str) -> Mapping[str, Any]:
     try:
         return flatten(read_entry(hyperparams_file(algo), env_id)[0])
     except ValueError:  # of another package

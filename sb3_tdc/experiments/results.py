@@ -129,7 +129,7 @@ class Run:
             return None
         return Evaluations(*read_arrays(path, "timesteps", "results"))
 
-    @property
+    @cached_property
     def log(self) -> pd.DataFrame:
         """``progress.csv``, empty if there is none."""
         try:
