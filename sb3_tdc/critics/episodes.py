@@ -202,7 +202,7 @@ def predict_quantiles(
     Predict the quantiles of all critics for observations and actions.
 
     :param observations: T of them, without a batch axis; arrays or dicts of arrays
-    :param actions: (T, A), as given to the environment
+    :param actions: (T, *shape of an action), as given to the environment
     :return: (T, C, N) quantiles of the critics, on the CPU
     """
     policy = model.policy
@@ -211,8 +211,9 @@ def predict_quantiles(
     for begin in range(0, len(observations), batch_size):
         stacked = stack_observations(observations[begin : begin + batch_size])
         with th.no_grad():
-            scaled = th.as_tensor(policy.scale_action(actions[begin : begin + batch_size]), device=model.device)
-            predicted.append(policy.critic(policy.obs_to_tensor(stacked)[0], scaled.float().flatten(1)).cpu())
+            scaled = policy.scale_action(actions[begin : begin + batch_size])
+            flat = th.as_tensor(scaled.reshape(len(scaled), -1), dtype=th.float32, device=model.device)
+            predicted.append(policy.critic(policy.obs_to_tensor(stacked)[0], flat).cpu())
     return th.cat(predicted)
 
 

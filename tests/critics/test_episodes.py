@@ -201,7 +201,10 @@ def test_episodes_too_short_to_know_a_return_leave_no_trace_in_the_log(tmp_path,
     assert "eval/overestimation" not in header
 
 
-def test_play_records_what_the_critics_say_about_the_action_that_is_played():
+@pytest.mark.filterwarnings("ignore:You have specified an action space")
+@pytest.mark.parametrize("shape", [(1,), (), (2, 3)])
+def test_play_records_what_the_critics_say_about_the_action_that_is_played(monkeypatch, shape):
+    monkeypatch.setattr(Corridor, "action_space", gym.spaces.Box(-2, 2, shape, dtype=np.float32))
     env = make_env(length=30)
     model = make_model(env, lam=0.5)
     (episode,) = explain.record_episodes(model, env, 1)
@@ -210,7 +213,7 @@ def test_play_records_what_the_critics_say_about_the_action_that_is_played():
     action, _ = model.predict(observation)
     scaled = model.policy.scale_action(action[None])
     with th.no_grad():
-        expected = model.critic(th.as_tensor(observation[None]), th.as_tensor(scaled))[0].numpy()
+        expected = model.critic(th.as_tensor(observation[None]), th.as_tensor(scaled.reshape(1, -1)))[0].numpy()
     np.testing.assert_allclose(episode.quantiles[7], expected, rtol=1e-5)
     scores = expected.mean(axis=1) - 0.5 * expected.std(axis=1)
     assert episode.selected[7] == scores.argmin()
