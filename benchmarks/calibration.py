@@ -1,5 +1,5 @@
 """
-What a calibrated λ costs: ``python -m benchmarks.calibration`` prints the share of training that it takes.
+What calibrating λ costs: ``python -m benchmarks.calibration`` prints its share of the time of a training.
 
 Processor time on one thread, on Hopper-v4 after a warm-up. Two whole trainings differ by more than this on a shared
 machine, so the calibration is timed where it happens.
@@ -11,16 +11,16 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 
-from sb3_tdc import TDC
+from sb3_tdc.experiments.calibration import CalibratedTDC
 
 WARM_UP, STEPS = 1_000, 5_000
 
 
 def main() -> None:
-    """Train with a calibrated λ, and print the share of the time that calibration takes."""
+    """Train, and print the share of the time that calibration takes."""
     th.set_num_threads(1)
     # A large τ, so that the calibration begins within the warm-up
-    model = TDC("MlpPolicy", gym.make("Hopper-v4"), lam="auto", learning_starts=100, tau=0.2, seed=0)
+    model = CalibratedTDC("MlpPolicy", gym.make("Hopper-v4"), learning_starts=100, tau=0.2, seed=0)
     model.learn(WARM_UP)
     follow, seconds = model._follow_episodes, 0.0
 

@@ -98,11 +98,6 @@ class AdvBTDC(Advised, TDC):
     }
     limits: ClassVar[Limits] = {**TDC.limits, **Advised.limits}
 
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        if isinstance(self.lam, str):  # it would be calibrated on the returns of the board
-            raise ValueError(f"lam must be a number or a schedule with a board, got {self.lam!r}")
-
     def _setup_model(self) -> None:
         super()._setup_model()
         self._advise_by_current_lam()

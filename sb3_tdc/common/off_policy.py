@@ -55,7 +55,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         for name in self.schedules:
             value = self.scheduled(name, progress_remaining=1.0)
             given = getattr(self, name)
-            if given is not None and not callable(given) and not isinstance(given, str):
+            if given is not None and not callable(given):
                 setattr(self, name, value)
         self._convert_train_freq()
         check_within(self.limits, "train_freq", self.train_freq.frequency)  # type: ignore[union-attr]

@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_tdc.common.returns import discounted_returns, known_steps
 from sb3_tdc.tdc import TDC
-from sb3_tdc.tdc.calibration import stack_observations
 from sb3_tdc.tdc.quantiles import mean_and_std, quantile_midpoints, select_critic
 
 
@@ -209,12 +208,19 @@ def predict_quantiles(
     policy.set_training_mode(False)
     predicted = []
     for begin in range(0, len(observations), batch_size):
-        stacked = stack_observations(observations[begin : begin + batch_size])
+        stacked = _stack(observations[begin : begin + batch_size])
         with th.no_grad():
             scaled = policy.scale_action(actions[begin : begin + batch_size])
             flat = th.as_tensor(scaled.reshape(len(scaled), -1), dtype=th.float32, device=model.device)
             predicted.append(policy.critic(policy.obs_to_tensor(stacked)[0], flat).cpu())
     return th.cat(predicted)
+
+
+def _stack(observations: Sequence[Any]) -> Any:
+    """Return a batch of observations, which are arrays or dicts of arrays."""
+    if isinstance(observations[0], dict):
+        return {key: np.stack([one[key] for one in observations]) for key in observations[0]}
+    return np.stack(observations)
 
 
 def record_episodes(model: TDC, env: VecEnv, n_episodes: int, limit: int | None = None) -> list[Episode]:

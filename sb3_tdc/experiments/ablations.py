@@ -13,8 +13,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.saved_fields import SavedField, number, or_none
+from sb3_tdc.experiments.calibration import MAX_LAM, CalibratedTDC
 from sb3_tdc.tdc import TDC
-from sb3_tdc.tdc.calibration import MAX_LAM
 from sb3_tdc.tdc.quantiles import Target
 
 # The weight of the newest measurement in the size of errors: the average is over about 1,000 updates
@@ -33,28 +33,23 @@ class ShiftedTDC(TDC):
         return target._replace(quantiles=target.quantiles - lowered)
 
 
-class PessimisticTDC(TDC):
+class PessimisticTDC(CalibratedTDC):
     """
     Two-sided calibration: where λ = 0 still overestimates, the target is lowered by β·(max μ − min μ).
 
-    One number is calibrated, by the rule of ``lam="auto"`` but for its bounds: above 0 it is λ, below 0 it is −β.
+    One number is calibrated: above 0 it is λ, below 0 it is −β.
     """
 
     saved_fields: ClassVar[dict[str, SavedField]] = {
-        **TDC.saved_fields,
-        "_lam_value": SavedField(or_none(number(-MAX_LAM)), is_required=False),
+        **CalibratedTDC.saved_fields,
+        "calibrated": SavedField(or_none(number(-MAX_LAM)), is_required=False),
     }
-    least_lam: ClassVar[float] = -MAX_LAM
-
-    def _check_arguments(self) -> None:
-        super()._check_arguments()
-        if not isinstance(self.lam, str):
-            raise ValueError(f'lam must be calibrated here: "auto", or "auto_" and a number, got {self.lam!r}')
+    least: ClassVar[float] = -MAX_LAM
 
     @property
     def pessimism(self) -> float:
         """β"""
-        return max(-self._calibrated_lam, 0.0)
+        return max(-(self.calibrated or 0.0), 0.0)
 
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
         target = super().make_target(next_quantiles, replay_data, lam)
@@ -77,6 +72,7 @@ class ScaledKappaTDC(TDC):
 
 
 ABLATIONS: dict[str, type[OffPolicyAlgorithm]] = {
+    "tdc-auto": CalibratedTDC,
     "tdc-shift": ShiftedTDC,
     "tdc-pessimism": PessimisticTDC,
     "tdc-kappa": ScaledKappaTDC,

@@ -171,9 +171,9 @@ class Report:
         section = Section(
             "λ (Fig. 3)",
             "Groups that differ in λ alone: learning curves, and, of at least two fixed λ, the final return against λ, "
-            "every seed a dot, mean and 95 % t interval where there are several. A λ that calibrates itself, or is a "
-            "schedule, has no place on that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and "
-            "HalfCheetah. Then variants of TDC next to the runs that they are compared with.",
+            "every seed a dot, mean and 95 % t interval where there are several. A schedule has no place on "
+            "that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and HalfCheetah. "
+            "Then variants of TDC next to the runs that they are compared with.",
         )
         import matplotlib
 

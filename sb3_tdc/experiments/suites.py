@@ -79,9 +79,10 @@ LAMBDA: dict[str, list[Cell]] = {
     "lambda": _shorter(
         100_000,
         ("Hopper-v4", "HalfCheetah-v4"),
-        *(("tdc", {"lam": lam}) for lam in (0.0, 0.5, 1.0, "auto")),
+        *(("tdc", {"lam": lam}) for lam in (0.0, 0.5, 1.0)),
+        ("tdc-auto", {"lam": 1.0}),
         ("tdc-shift", {"lam": 1.0}),
-        ("tdc-pessimism", {"lam": "auto"}),
+        ("tdc-pessimism", {"lam": 1.0}),
         ("tdc-kappa", {"lam": 1.0}),
     )
 }

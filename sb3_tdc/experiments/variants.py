@@ -15,8 +15,11 @@ from scipy import stats
 from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.ablations import ABLATIONS
 from sb3_tdc.experiments.groups import Group, by_conditions, is_same_but
+from sb3_tdc.tdc import TDC
 
 _LEVEL = 0.05
+_NAMES = {cls: name for name, cls in {"tdc": TDC, **ABLATIONS}.items()}
+_PARENTS = {name: _NAMES[cls.__bases__[0]] for name, cls in ABLATIONS.items()}
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
     """
     Return the comparisons under all conditions.
 
-    λ is compared with λ = 0, and an algorithm of the ablations with TDC of the same hyperparameters.
+    λ is compared with λ = 0, and an ablation with the algorithm that it derives from, of the same hyperparameters.
     """
     found = []
     for alike in by_conditions(groups).values():
@@ -60,10 +63,10 @@ def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
 def _pairs(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
     finished = [group for group in groups if group.finished]
     for variant in finished:
-        for control in (group for group in finished if group.algo == "tdc" and group is not variant):
-            of_lam = variant.algo == "tdc" and control.setting("lam") == 0 and is_same_but("lam", variant, control)
-            of_algorithm = variant.algo in ABLATIONS and is_same_but("algo", variant, control)
-            if of_lam or of_algorithm:
+        for control in (group for group in finished if group is not variant):
+            is_of_lam = variant.algo == "tdc" and control.setting("lam") == 0 and is_same_but("lam", variant, control)
+            is_ablation = control.algo == _PARENTS.get(variant.algo) and is_same_but("algo", variant, control)
+            if is_of_lam or is_ablation:
                 yield variant, control
 
 

@@ -11,7 +11,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -32,16 +31,7 @@ from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.common.noise import noise_of_all
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
-from sb3_tdc.common.untrusted import shown
 from sb3_tdc.common.versions import numba_version
-from sb3_tdc.tdc.calibration import (
-    Calibration,
-    PendingEpisode,
-    calibrate,
-    initial_lam,
-    stack_observations,
-    updates_before,
-)
 from sb3_tdc.tdc.fused import FusedUpdate, obstacles
 from sb3_tdc.tdc.lam import describe_selection
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
@@ -62,19 +52,6 @@ UNITS_INTERVAL = 500
 # Where the gradient stays zero (dead ReLUs), Adam's moments decay into denormal numbers and never leave them: 0.9 times
 # the smallest one is rounded to itself. Intel's processors compute with them many times slower. Next to ε they are 0
 FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
-
-
-def _lam_field(name: str, value: Any) -> Any:
-    """Take a number, a schedule, or how to calibrate λ."""
-    return _lam_text(name, value) if isinstance(value, str) else schedule(name, value)
-
-
-def _lam_text(name: str, value: Any) -> str:
-    """Take how to calibrate λ."""
-    if not isinstance(value, str):
-        raise ValueError(f"{name} must be a text, got {shown(value)}")
-    initial_lam(value)
-    return value
 
 
 class TDC(CheckedOffPolicyAlgorithm):
@@ -103,8 +80,7 @@ class TDC(CheckedOffPolicyAlgorithm):
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
     :param n_steps: n-step returns if > 1 (with the ``NStepReplayBuffer``)
     :param lam: λ ≥ 0, the weight of the spread in the selection of the target critic (Eq. 5), or a schedule. λ only
-        selects; 0 takes the smaller mean (TD3's clipped double), and a larger λ never gives a smaller target mean.
-        ``"auto"`` calibrates it on finished episodes (see docs/tdc.md), ``"auto_0.5"`` from 0.5 on
+        selects; 0 takes the smaller mean (TD3's clipped double), and a larger λ never gives a smaller target mean
     :param stochastic_actor: ζ: a tanh-Gaussian head trained with entropy (True), or a deterministic one (False).
         Exploration and evaluation use the mean action with both
     :param qf_learning_rate: η_Q, learning rate of the critics, or a schedule; None: as ``learning_rate``
@@ -140,12 +116,8 @@ class TDC(CheckedOffPolicyAlgorithm):
         "n_quantiles": (1, math.inf),
     }
     schedules: ClassVar[tuple[str, ...]] = ("lam", "learning_rate", "qf_learning_rate")
-    least_lam: ClassVar[float] = 0.0  # of a calibration
     saved_fields: ClassVar[dict[str, SavedField]] = {
-        "lam": SavedField(_lam_field),
-        "_lam_value": SavedField(or_none(number(0.0)), is_required=False),
-        "_lam_scale": SavedField(number(0.0), is_required=False),
-        "_lam_start": SavedField(or_none(_lam_text), is_required=False),
+        "lam": SavedField(schedule),
         "kappa": SavedField(number(0.0)),
         "qf_learning_rate": SavedField(or_none(schedule)),
         "stochastic_actor": SavedField(boolean),
@@ -165,7 +137,6 @@ class TDC(CheckedOffPolicyAlgorithm):
     changeable: ClassVar[tuple[str, ...]] = (
         *("lam", "kappa", "qf_learning_rate", "policy_delay", "target_policy_noise", "target_noise_clip"),
     )
-    captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics", "_calibration")
     color: ClassVar[str | None] = "#0072B2"
     policy: TDCPolicy
     replay_buffer: ReplayBuffer
@@ -187,7 +158,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        lam: float | Schedule | str = 1.0,
+        lam: float | Schedule = 1.0,
         stochastic_actor: bool = False,
         qf_learning_rate: float | Schedule | None = None,
         kappa: float = 1.0,
@@ -248,10 +219,6 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.ent_coef_optimizer: Any = None
         self.ent_coef_tensor: Any = None
         self.fused = fused
-        # Of a calibrated λ: where it is, the moving average of |G − Q₁|, and the text that both belong to
-        self._lam_value: float | None = None
-        self._lam_scale = 0.0
-        self._lam_start: str | None = None
 
         if _init_setup_model:
             self._setup_model()
@@ -263,8 +230,6 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.stochastic_actor = bool(check_boolean("stochastic_actor", self.stochastic_actor))
         self.fused = check_boolean("fused", self.fused, or_none=True)
         self._check_limits("kappa", "target_policy_noise", "target_noise_clip", "policy_delay")
-        if isinstance(self.lam, str):
-            initial_lam(self.lam)
         for name in ("n_quantiles", "n_critics"):
             check_within(self.limits, name, self.policy_kwargs.get(name, 1), f"policy_kwargs[{name!r}]")
         if self.target_entropy != "auto":
@@ -297,14 +262,7 @@ class TDC(CheckedOffPolicyAlgorithm):
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
         if name == "qf_learning_rate" and self.qf_learning_rate is None:
             name = "learning_rate"
-        if name == "lam" and isinstance(self.lam, str):
-            return max(self._calibrated_lam, 0.0)
         return super().scheduled(name, progress_remaining)
-
-    @property
-    def _calibrated_lam(self) -> float:
-        start = initial_lam(self.lam)  # type: ignore[arg-type]
-        return start if self._lam_value is None or self._lam_start != self.lam else self._lam_value
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -319,7 +277,6 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         self._setup_fused_update()
         self._setup_temperature()
-        self._calibration = Calibration(self._n_updates)
 
     @property
     def action_noise(self) -> ActionNoise | None:
@@ -635,79 +592,6 @@ class TDC(CheckedOffPolicyAlgorithm):
     ) -> SelfTDC:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
 
-    # ---------------------------------------------------------------- λ by calibration
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        observation, timestep = self._last_obs, self.num_timesteps
-        prepared = super()._setup_learn(*args, **kwargs)
-        # A callback that stops a rollout makes SB3 lose its last step
-        if self._last_obs is not observation or timestep != self._calibration.timestep:
-            self.forget_episodes()
-        return prepared
-
-    def forget_episodes(self) -> None:
-        self._calibration.begin_episodes(self.n_envs)
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        if isinstance(self.lam, str):
-            self._follow_episodes(buffer_action, reward, dones, infos)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-
-    def _follow_episodes(
-        self, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
-    ) -> None:
-        """Add a step to the episodes, and change λ if enough of them have ended."""
-        normalization, calibration = self._vec_normalize_env, self._calibration
-        rewards = reward if normalization is None else normalization.get_original_reward()
-        observations: Any = self._last_obs
-        for i, episode in calibration.episodes.items():
-            one = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
-            episode.add(one, action[i], float(rewards[i]))
-            if dones[i]:
-                counts = self._n_updates >= updates_before(self.tau, self.gamma)
-                calibration.end_episode(i, self._prediction_errors(episode, infos[i]) if counts else None)
-        calibration.timestep = self.num_timesteps
-        errors = calibration.take_errors(self._n_updates)
-        if errors is not None:
-            self._calibrate_lam(errors)
-
-    def _prediction_errors(self, episode: PendingEpisode, info: dict[str, Any]) -> np.ndarray:
-        """Return G − Q₁ at steps of an ended episode; what comes after a time limit is in G as Q₁ has it."""
-        self.policy.set_training_mode(False)
-        rewards = np.asarray(episode.rewards)
-        if self._vec_normalize_env is not None:  # as the critics learn them
-            rewards = self._vec_normalize_env.normalize_reward(rewards)
-        following = 0.0
-        if info.get("TimeLimit.truncated", False) and getattr(self.replay_buffer, "handle_timeout_termination", True):
-            last = stack_observations([info["terminal_observation"]])
-            with th.no_grad():
-                action = self.policy._predict(self.policy.obs_to_tensor(last)[0], deterministic=True)
-            following = float(self._first_values(last, action)[0])
-        returns = episode.returns(rewards, self.gamma, following)
-        actions = th.as_tensor(np.stack(episode.actions), device=self.device)
-        return returns - self._first_values(stack_observations(episode.observations), actions)
-
-    def _first_values(self, observations: Any, actions: th.Tensor) -> np.ndarray:
-        """Q₁ (T,) of a batch of observations as they come, and actions in [-1, 1]."""
-        with th.no_grad():
-            some, flat = self.policy.obs_to_tensor(observations)[0], actions.float().reshape(len(actions), -1)
-            return self.critic.q1_forward(some, flat).squeeze(1).cpu().numpy()  # type: ignore[arg-type]
-
-    def _calibrate_lam(self, errors: np.ndarray) -> None:
-        begun = self._lam_start == self.lam
-        lam, scale = self._calibrated_lam, self._lam_scale if begun else 0.0
-        self._lam_value, self._lam_scale = calibrate(lam, scale, errors, self.least_lam)
-        self._lam_start = str(self.lam)
-        self.diagnose(lam_error=float(errors.mean()), lam_scale=self._lam_scale)
-
     # ---------------------------------------------------------------- saving
 
     @classmethod
@@ -752,7 +636,7 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_fused_update", "_built_ent_coef", "_calibration"]
+        derived = ["_obstacles", "_fused_update", "_built_ent_coef"]
         return [*super()._excluded_save_params(), *networks, *derived]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

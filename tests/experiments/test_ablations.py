@@ -7,9 +7,9 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.experiments.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC, know_ablations
+from sb3_tdc.experiments.calibration import CalibratedTDC
 from sb3_tdc.hyperparams import hyperparams_file
 from sb3_tdc.runs.models import load_model
-from sb3_tdc.tdc import TDC
 from tests.helpers.tdc import BATCH, SMALL, random_batches
 
 
@@ -44,10 +44,10 @@ def test_the_shifted_target_is_lower_by_lam_standard_deviations():
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(("calibrated", "lam", "beta"), [(0.5, 0.5, 0.0), (-0.8, 0.0, 0.8), (None, 0.0, 0.0)])
+@pytest.mark.parametrize(("calibrated", "lam", "beta"), [(0.5, 0.5, 0.0), (-0.8, 0.0, 0.8), (0.0, 0.0, 0.0)])
 def test_below_zero_the_calibrated_number_is_pessimism(calibrated, lam, beta):
-    model = make(PessimisticTDC, lam="auto_0.0", gamma=0.9)
-    model._lam_value, model._lam_start = calibrated, "auto_0.0"
+    model = make(PessimisticTDC, gamma=0.9)
+    model.calibrated = calibrated
     assert (model.scheduled("lam"), model.pessimism) == (lam, beta)
     batch, quantiles, found = targets(model, lam)
     mean, _, chosen = moments(quantiles, lam)
@@ -68,12 +68,12 @@ def test_n_step_returns_are_lowered_by_their_own_discounts():
 
 
 def test_overestimation_goes_on_into_pessimism_and_back():
-    model = make(PessimisticTDC, lam="auto_0.0")
+    model = make(PessimisticTDC, lam=0.0)
     model.learn(10)
     for error, expected in ((-1.0, -0.1), (-1.0, -0.2), (1.0, -0.1), (1.0, 0.0), (1.0, 0.1)):
-        model._calibrate_lam(np.array([error]))
-        assert model._calibrated_lam == pytest.approx(expected)
-    assert TDC.least_lam == 0.0
+        model._calibrate(np.array([error]))
+        assert model.calibrated == pytest.approx(expected)
+    assert CalibratedTDC.least == 0.0
 
 
 def test_kappa_follows_the_errors_that_it_bounds():
@@ -93,23 +93,17 @@ def test_saved_and_opened(name, tmp_path):
     before = dict(ALGORITHMS)
     know_ablations()
     try:
-        lam = "auto_0.0" if name == "tdc-pessimism" else 1.0
-        model = make(ABLATIONS[name], lam=lam)
+        model = make(ABLATIONS[name], lam=0.0)
         model.learn(60)
         if name == "tdc-pessimism":
-            model._calibrate_lam(np.array([-1.0]))
+            model._calibrate(np.array([-1.0]))
             assert model.pessimism == pytest.approx(0.1)
         model.save(tmp_path / "model.zip")
         opened = load_model(tmp_path / "model.zip", name, None, False, device="cpu")
         assert type(opened) is ABLATIONS[name]
         assert opened.kappa == model.kappa
-        assert opened._lam_value == model._lam_value
+        assert getattr(opened, "calibrated", None) == getattr(model, "calibrated", None)
         assert hyperparams_file(name) == hyperparams_file("tdc")
     finally:
         ALGORITHMS.clear()
         ALGORITHMS.update(before)
-
-
-def test_pessimism_is_calibrated_or_nothing():
-    with pytest.raises(ValueError, match=r"lam must be calibrated here: .*, got 1.0"):
-        make(PessimisticTDC, lam=1.0)

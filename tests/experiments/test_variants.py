@@ -43,17 +43,20 @@ def test_holm_s_rejections_are_those_of_its_definition(p_values):
 
 
 def test_each_variant_has_a_control_that_differs_in_one_thing(tmp_path):
-    for lam in (0.0, 0.5, "auto"):
+    for lam in (0.0, 0.5, "lin_1.0"):
         make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], lam=lam)
-    make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo="tdc-shift", lam=0.5)
+    for algo in ("tdc-shift", "tdc-auto", "tdc-pessimism"):
+        make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo=algo, lam=0.5)
     make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo="tdc-kappa", lam=0.5, tau=0.3)  # no control with this τ
     make_runs(tmp_path, [(1.0, 2.0), (2.0, 3.0)], algo="td3")
     found = compare_variants(group_runs(find_runs(tmp_path)[0]))
     pairs = {tuple((group.algo, group.setting("lam")) for group in (c.variant, c.control)) for c in found}
     assert pairs == {
         (("tdc", 0.5), ("tdc", 0.0)),
-        (("tdc", "auto"), ("tdc", 0.0)),
+        (("tdc", "lin_1.0"), ("tdc", 0.0)),
         (("tdc-shift", 0.5), ("tdc", 0.5)),
+        (("tdc-auto", 0.5), ("tdc", 0.5)),
+        (("tdc-pessimism", 0.5), ("tdc-auto", 0.5)),
     }
 
 
@@ -121,13 +124,13 @@ def test_one_seed_decides_nothing(tmp_path):
     assert (found.difference[0], found.verdict) == (1, "undecided: too few seeds")
 
 
-def test_a_calibrated_lam_has_its_curve_next_to_the_numbers(tmp_path):
+def test_a_schedule_has_its_curve_next_to_the_numbers(tmp_path):
     pytest.importorskip("matplotlib")
-    for lam in (0.0, 0.5, "auto"):
+    for lam in (0.0, 0.5, "lin_1.0"):
         make_runs(tmp_path / "logs", [(1.0, 2.0), (2.0, 3.0)], lam=lam)
     groups = group_runs(find_runs(tmp_path / "logs")[0])
     section = sections.Report(groups, tmp_path / "report").lambda_sweep()
     where = groups[0].conditions.file_name
     assert [picture.name for picture in section.pictures] == [f"lambda-curves-1-{where}", f"lambda-sweep-1-{where}"]
-    assert "λ = auto: 2 (1, 2)" in section.pictures[0].caption
+    assert "λ = lin_1.0: 2 (1, 2)" in section.pictures[0].caption
     assert (tmp_path / "report" / "tables" / "variants.csv").is_file()

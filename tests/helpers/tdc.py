@@ -69,10 +69,10 @@ SMALL = {"net_arch": [16, 16], "n_quantiles": 5}
 HEADS = pytest.mark.parametrize("stochastic_actor", [False, True], ids=["deterministic", "stochastic"])
 
 
-def make(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
+def make(env="Pendulum-v1", policy="MlpPolicy", algorithm=TDC, **kwargs):
     policy_kwargs = {**SMALL, **kwargs.pop("policy_kwargs", {})}
     defaults = {"learning_starts": 40, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
-    return TDC(policy, env, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
+    return algorithm(policy, env, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
 
 
 def weights(model):

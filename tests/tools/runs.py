@@ -28,8 +28,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_tdc import MEOW, TDC
 from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
 from sb3_tdc.envs.registry import require_env, simulator_of
+from sb3_tdc.experiments import calibration
 from sb3_tdc.resume import Restorable, ResumeStates
-from sb3_tdc.tdc import calibration
 
 STEPS = 300
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
@@ -154,7 +154,9 @@ OTHERS = {
     ),
     "AdvB-TD3": Case("Hopper-v4", AdvBTD3, kwargs={"formation_period": 3}),
     "AdvB-SAC": Case("Hopper-v4", AdvBSAC, n_envs=2, wrap=VecNormalize),
-    "calibrated λ": Case("Hopper-v4", n_envs=2, kwargs={"lam": "auto_0.5", "gamma": 0.5, "tau": 1.0}),
+    "calibrated λ": Case(
+        "Hopper-v4", calibration.CalibratedTDC, n_envs=2, kwargs={"lam": 0.5, "gamma": 0.5, "tau": 1.0}
+    ),
     "AdvB-TDC": Case("Hopper-v4", AdvBTDC, kwargs={"formation_period": 2, "lam": LinearSchedule(1.0, 0, 1)}),
     "SAC, gSDE": Case("Hopper-v4", SAC, n_envs=2, kwargs={"use_sde": True, "sde_sample_freq": 4}),
     "TQC, gSDE": Case("Hopper-v4", TQC, kwargs={"use_sde": True}),

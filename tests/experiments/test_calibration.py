@@ -1,4 +1,4 @@
-"""λ that tunes itself: the direction, the units, what counts, and that it survives stopping."""
+"""λ that calibrates itself: the direction, the units, what counts, and that it survives stopping."""
 
 import math
 
@@ -13,12 +13,17 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_tdc import TDC, load_safely
-from sb3_tdc.advb import AdvBTDC
 from sb3_tdc.common.returns import discounted_returns, known_steps
+from sb3_tdc.experiments import calibration
+from sb3_tdc.experiments.calibration import (
+    MAX_LAM,
+    CalibratedTDC,
+    Calibration,
+    PendingEpisode,
+    calibrate,
+    updates_before,
+)
 from sb3_tdc.resume.run_state import _restart_episodes as restart_episodes
-from sb3_tdc.tdc import calibration
-from sb3_tdc.tdc.calibration import MAX_LAM, Calibration, PendingEpisode, calibrate, initial_lam, updates_before
 from tests.helpers.tdc import HEADS, TwoActions, make
 
 errors = arrays(np.float64, 5, elements=st.floats(-100, 100, width=32))
@@ -31,7 +36,7 @@ def short_period(monkeypatch):
 
 def make_fast(env=None, **kwargs):
     """Whose calibration begins after two updates."""
-    return make(env or TwoActions(), **{"lam": "auto", "tau": 1.0, "gamma": 0.5, **kwargs})
+    return make(env or TwoActions(), algorithm=CalibratedTDC, **{"tau": 1.0, "gamma": 0.5, **kwargs})
 
 
 # ---------------------------------------------------------------- the rule
@@ -39,19 +44,19 @@ def make_fast(env=None, **kwargs):
 
 def test_one_step_by_hand():
     # The first errors set the scale, |4| and |−2| on average: 3; λ moves by 0.1 · 1/3
-    lam, scale = calibrate(1.0, 0.0, np.array([4.0, -2.0]))
+    lam, scale = calibrate(1.0, 0.0, np.array([4.0, -2.0]), 0.0)
     assert (lam, scale) == (pytest.approx(1 + 0.1 / 3), 3)
     # Then the scale moves by a twentieth of the way from 3 to 1, to 2.9; λ falls by 0.1/2.9
-    lam, scale = calibrate(lam, scale, np.array([-1.0]))
+    lam, scale = calibrate(lam, scale, np.array([-1.0]), 0.0)
     assert scale == pytest.approx(2.9)
     assert lam == pytest.approx(1 + 0.1 / 3 - 0.1 / 2.9)
     # An error of many times the scale moves λ no further than by 0.1
-    assert calibrate(1.0, 0.01, np.array([50.0]))[0] == pytest.approx(1.1)
+    assert calibrate(1.0, 0.01, np.array([50.0]), 0.0)[0] == pytest.approx(1.1)
 
 
 @given(errors, st.floats(0, MAX_LAM), st.floats(0, 10))
 def test_underestimation_raises_lam_and_overestimation_lowers_it(errors, lam, scale):
-    new, _ = calibrate(lam, scale, errors)
+    new, _ = calibrate(lam, scale, errors, 0.0)
     assert 0 <= new <= MAX_LAM
     assert abs(new - lam) <= 0.1 + 1e-12
     assert (new - lam) * errors.mean() >= 0
@@ -59,33 +64,24 @@ def test_underestimation_raises_lam_and_overestimation_lowers_it(errors, lam, sc
 
 @given(errors, st.floats(0.1, 10), st.floats(0.01, 1000))
 def test_the_scale_of_rewards_does_not_matter(errors, scale, factor):
-    expected, size = calibrate(1.0, scale, errors)
-    found, larger = calibrate(1.0, factor * scale, factor * errors)
+    expected, size = calibrate(1.0, scale, errors, 0.0)
+    found, larger = calibrate(1.0, factor * scale, factor * errors, 0.0)
     assert (found, larger) == (pytest.approx(expected), pytest.approx(factor * size))
 
 
 def test_no_error_is_no_division():
-    assert calibrate(1.0, 0.0, np.zeros(3)) == (1.0, 0.0)
+    assert calibrate(1.0, 0.0, np.zeros(3), 0.0) == (1.0, 0.0)
 
 
-@pytest.mark.parametrize(("text", "expected"), [("auto", 1), ("auto_0.5", 0.5), ("auto_0", 0), ("auto_10", 10)])
-def test_where_it_begins(text, expected):
-    assert initial_lam(text) == expected
-    assert make(lam=text).scheduled("lam") == expected
+@pytest.mark.parametrize("lam", [0.0, 0.5, 10.0])
+def test_where_it_begins(lam):
+    assert make_fast(lam=lam).scheduled("lam") == lam
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["automatic", "auto_-1", "auto_nan", "auto_11", "high", "auto0.5", "auto_", "auto_+0.5", "auto_1_0", "auto_5E-1"],
-)
-def test_other_texts_are_refused(text):
-    with pytest.raises(ValueError, match="lam must be"):
-        make(lam=text)
-
-
-def test_a_board_has_no_calibration():
-    with pytest.raises(ValueError, match="lam must be a number or a schedule with a board, got 'auto'"):
-        AdvBTDC("MlpPolicy", TwoActions(), lam="auto", buffer_size=100)
+@pytest.mark.parametrize("lam", [-0.1, 10.1, math.nan, "auto", lambda progress: 1.0])
+def test_it_begins_at_a_number_up_to_10(lam):
+    with pytest.raises(ValueError, match=r"^lam.* must be"):
+        make_fast(lam=lam)
 
 
 def test_it_waits_until_values_can_have_their_size():
@@ -260,7 +256,7 @@ def test_it_follows_the_sign_of_the_error(short_period, reward, rises):
 
 def test_it_works_where_time_limits_are_short(monkeypatch):
     monkeypatch.setattr(calibration, "PERIOD", 200)
-    model = make(lam="auto", tau=1.0, gamma=0.9, qf_learning_rate=0.0).learn(700)  # Pendulum: 200 steps
+    model = make(algorithm=CalibratedTDC, tau=1.0, gamma=0.9, qf_learning_rate=0.0).learn(700)  # Pendulum: 200 steps
     assert model.scheduled("lam") < 1  # values of 0, and costs
 
 
@@ -270,7 +266,7 @@ def test_both_paths_calibrate_alike(short_period, stochastic_actor, n_envs):
     lams = []
     for fused in (False, True):
         env = make_vec_env(TwoActions, n_envs, seed=1)
-        model = make_fast(env, lam="auto_0.5", fused=fused, stochastic_actor=stochastic_actor).learn(300)
+        model = make_fast(env, lam=0.5, fused=fused, stochastic_actor=stochastic_actor).learn(300)
         lams.append(model.scheduled("lam"))
     assert lams[0] != 0.5
     assert lams[0] == pytest.approx(lams[1], abs=1e-3)
@@ -306,27 +302,10 @@ def test_it_is_saved_and_continues(tmp_path, short_period):
     value = model.scheduled("lam")
     assert value != 1
     model.save(tmp_path / "model.zip")
-    for loaded in (TDC.load(tmp_path / "model.zip"), load_safely(tmp_path / "model.zip", device="cpu")):
-        assert (loaded.lam, loaded.scheduled("lam"), loaded._lam_scale) == ("auto", value, model._lam_scale)
-        loaded.set_env(make_vec_env(TwoActions, 1))
-        loaded.learn(100, reset_num_timesteps=False)
-        assert loaded.scheduled("lam") != value
-
-
-def test_another_start_begins_anew(tmp_path, short_period):
-    model = make_fast().learn(200)
-    model.save(tmp_path / "model.zip")
-    loaded = TDC.load(tmp_path / "model.zip", env=TwoActions(), lam="auto_0.2")
-    assert loaded.scheduled("lam") == 0.2
+    loaded = CalibratedTDC.load(tmp_path / "model.zip", env=TwoActions())
+    assert (loaded.lam, loaded.scheduled("lam"), loaded.error_scale) == (1.0, value, model.error_scale)
     loaded.learn(100, reset_num_timesteps=False)
-    assert 0 <= loaded.scheduled("lam") < 0.9
-    model.lam = 0.7
-    assert model.scheduled("lam") == 0.7
-    model.lam = "auto_3"
-    assert model.scheduled("lam") == 3
-    model.lam = "nonsense"
-    with pytest.raises(ValueError, match=r"lam must be .*, got 'nonsense'"):
-        model.learn(10, reset_num_timesteps=False)
+    assert loaded.scheduled("lam") != value
 
 
 def lengths_of_episodes(monkeypatch):
@@ -369,7 +348,7 @@ def test_episodes_that_start_again_are_new(monkeypatch):
 def test_without_a_reset_the_next_episodes_are_followed_too(tmp_path, short_period):
     model = make_fast().learn(100)
     model.save(tmp_path / "model.zip")
-    loaded = TDC.load(tmp_path / "model.zip", env=make_vec_env(TwoActions, 1), force_reset=False)
+    loaded = CalibratedTDC.load(tmp_path / "model.zip", env=make_vec_env(TwoActions, 1), force_reset=False)
     value = loaded.scheduled("lam")
     loaded.env.reset()
     loaded.learn(100, reset_num_timesteps=False)
@@ -380,14 +359,14 @@ def test_calibrating_changes_nothing_else(short_period):
     """λ is put back after every calibration: the same weights as with this λ."""
 
     def calibrate_and_put_back(errors):
-        TDC._calibrate_lam(held, errors)
-        calibrated.append(held._lam_value)
-        held._lam_value = 0.5
+        CalibratedTDC._calibrate(held, errors)
+        calibrated.append(held.calibrated)
+        held.calibrated = 0.5
 
     calibrated = []
-    plain = make_fast(lam=0.5, seed=3).learn(150)
-    held = make_fast(lam="auto_0.5", seed=3)
-    held._calibrate_lam = calibrate_and_put_back
+    plain = make(TwoActions(), tau=1.0, gamma=0.5, lam=0.5, seed=3).learn(150)
+    held = make_fast(lam=0.5, seed=3)
+    held._calibrate = calibrate_and_put_back
     held.learn(150)
     assert set(calibrated) - {0.5}
     for one, other in zip(plain.policy.parameters(), held.policy.parameters(), strict=True):

@@ -1,0 +1,245 @@
+"""
+TDC whose λ calibrates itself: returns of training episodes against the first critic's predictions.
+
+After ACC (Dorka et al. 2021); docs/lambda.md has the equations, and what was found.
+"""
+
+import copy
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_tdc.common.checks import Limits
+from sb3_tdc.common.returns import discounted_returns
+from sb3_tdc.common.saved_fields import SavedField, number, or_none
+from sb3_tdc.critics.episodes import predict_quantiles
+from sb3_tdc.tdc import TDC
+
+# The largest λ of a calibration: beyond, the wider critic is selected nearly everywhere
+MAX_LAM = 10.0
+# η, the largest change of λ at once
+RATE = 0.1
+# The weight of the newest error in the moving average of their size
+SCALE_WEIGHT = 0.05
+# Steps whose returns are awaited, and updates, between two changes of λ
+PERIOD = 1_000
+# Steps of an episode between those whose values are predicted: neighbours tell the same
+EVERY = 10
+# Of more environments, so many are followed
+MAX_FOLLOWED = 16
+# The longest horizon, 1/(1 − γ), for which a calibration waits in the beginning
+_MAX_HORIZON = 1_000
+
+
+def calibrate(lam: float, scale: float, errors: np.ndarray, least: float) -> tuple[float, float]:
+    """
+    Move λ towards values that are right on average: up after underestimation, down after overestimation.
+
+    λ ← clip(λ + η·clip(mean(G − Q₁)/scale, −1, 1), least, λ_max), where scale is a moving average of |G − Q₁|, so that
+    the scale of rewards does not matter.
+
+    :param lam: λ
+    :param scale: 0 before the first errors
+    :param errors: G − Q₁
+    :return: λ and scale
+    """
+    size = float(np.abs(errors).mean())
+    scale = scale + SCALE_WEIGHT * (size - scale) if scale > 0 else size
+    share = float(np.clip(errors.mean() / scale, -1, 1)) if scale > 0 else 0.0
+    return float(np.clip(lam + RATE * share, least, MAX_LAM)), scale
+
+
+def updates_before(tau: float, gamma: float) -> float:
+    """
+    Return after how many updates a calibration begins: 1/(τ·(1 − γ)).
+
+    Values grow from those of new networks to their size over as many: a target takes about 1/τ updates to follow, and
+    the values of 1/(1 − γ) steps follow one another. That they are too small until then is not λ's doing.
+    """
+    horizon = min(1 / (1 - gamma), _MAX_HORIZON) if gamma < 1 else _MAX_HORIZON
+    return horizon / tau if tau > 0 else math.inf
+
+
+class PendingEpisode:
+    """The rewards of an episode under way, and every ``EVERY``-th observation and action."""
+
+    def __init__(self) -> None:
+        self.rewards: list[float] = []
+        self.observations: list[Any] = []
+        self.actions: list[np.ndarray] = []
+
+    def add(self, observation: Any, action: np.ndarray, reward: float) -> None:
+        """
+        Add a step.
+
+        :param observation: as the policy saw it, without a batch axis
+        :param action: as given to the environment
+        :param reward: as the environment gave it
+        """
+        if len(self.rewards) % EVERY == 0:
+            self.observations.append(copy.deepcopy(observation))
+            self.actions.append(action.copy())
+        self.rewards.append(reward)
+
+    def returns(self, rewards: np.ndarray, gamma: float, following: float) -> np.ndarray:
+        """
+        Return the discounted returns of the steps that were looked at.
+
+        :param rewards: those of the episode, in the critics' units
+        :param following: the value of what comes after the last step; 0 where the episode ended by itself
+        """
+        return discounted_returns(rewards, gamma, following)[::EVERY]
+
+
+class Calibration:
+    """
+    The episodes under way, and the errors of the ended ones since λ was changed.
+
+    :ivar timestep: of the last step that was followed
+    :ivar last_update: count of gradient steps when λ was changed
+    """
+
+    def __init__(self, n_updates: int = 0) -> None:
+        self.episodes: dict[int, PendingEpisode] = {}
+        self.errors: list[np.ndarray] = []
+        self.n_steps = 0
+        self.last_update = n_updates
+        self.timestep: int | None = None
+
+    def begin_episodes(self, n_envs: int) -> None:
+        """Forget the episodes under way. Of many environments, which may explore differently, some are followed."""
+        followed = np.linspace(0, n_envs - 1, min(n_envs, MAX_FOLLOWED)).round().astype(int)
+        self.episodes = {int(i): PendingEpisode() for i in followed}
+
+    def end_episode(self, env: int, errors: np.ndarray | None) -> None:
+        """
+        Begin the next episode of an environment.
+
+        :param errors: G − Q₁ of the ended one, where it counts
+        """
+        if errors is not None:
+            self.errors.append(errors)
+            self.n_steps += len(self.episodes[env].rewards)
+        self.episodes[env] = PendingEpisode()
+
+    def take_errors(self, n_updates: int) -> np.ndarray | None:
+        """
+        Return the errors with which λ is to be changed now, if it is.
+
+        :param n_updates: count of gradient steps
+        """
+        if self.n_steps < PERIOD or n_updates - self.last_update < PERIOD:
+            return None
+        errors = np.concatenate(self.errors)
+        self.errors, self.n_steps, self.last_update = [], 0, n_updates
+        return errors
+
+
+class CalibratedTDC(TDC):
+    """
+    TDC whose λ begins at ``lam``, rises after underestimation and falls after overestimation.
+
+    :param args: those of TDC
+    :param kwargs: those of TDC; ``lam`` is a number of at most 10
+    :ivar calibrated: what is calibrated; where it is not negative, λ
+    :ivar error_scale: moving average of |G − Q₁|; 0 before the first errors
+    """
+
+    limits: ClassVar[Limits] = {**TDC.limits, "lam": (0.0, MAX_LAM)}
+    saved_fields: ClassVar[dict[str, SavedField]] = {
+        **TDC.saved_fields,
+        "calibrated": SavedField(or_none(number(0.0)), is_required=False),
+        "error_scale": SavedField(number(0.0), is_required=False),
+    }
+    captured_attributes: ClassVar[tuple[str, ...]] = (*TDC.captured_attributes, "_calibration")
+    least: ClassVar[float] = 0.0  # of what is calibrated
+    calibrated: float | None = None
+    error_scale: float = 0.0
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if callable(self.lam):
+            raise ValueError("lam must be a number here, where its calibration begins, got a schedule")
+        self._check_limits("lam")
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.calibrated is None:
+            self.calibrated = float(self.lam)  # type: ignore[arg-type]  # not a schedule
+        self._calibration = Calibration(self._n_updates)
+
+    def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
+        if name == "lam" and progress_remaining is None and self.calibrated is not None:
+            return max(self.calibrated, 0.0)
+        return super().scheduled(name, progress_remaining)
+
+    # ---------------------------------------------------------------- episodes
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        observation, timestep = self._last_obs, self.num_timesteps
+        prepared = super()._setup_learn(*args, **kwargs)
+        # A callback that stops a rollout makes SB3 lose its last step
+        if self._last_obs is not observation or timestep != self._calibration.timestep:
+            self.forget_episodes()
+        return prepared
+
+    def forget_episodes(self) -> None:
+        self._calibration.begin_episodes(self.n_envs)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._follow_episodes(self.policy.unscale_action(buffer_action), reward, dones, infos)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _follow_episodes(
+        self, actions: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        """Add a step to the episodes, and change λ if enough of them have ended."""
+        normalization, calibration = self._vec_normalize_env, self._calibration
+        rewards = reward if normalization is None else normalization.get_original_reward()
+        observations: Any = self._last_obs
+        for i, episode in calibration.episodes.items():
+            one = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
+            episode.add(one, actions[i], float(rewards[i]))
+            if dones[i]:
+                counts = self._n_updates >= updates_before(self.tau, self.gamma)
+                calibration.end_episode(i, self._prediction_errors(episode, infos[i]) if counts else None)
+        calibration.timestep = self.num_timesteps
+        errors = calibration.take_errors(self._n_updates)
+        if errors is not None:
+            self._calibrate(errors)
+
+    def _prediction_errors(self, episode: PendingEpisode, info: dict[str, Any]) -> np.ndarray:
+        """Return G − Q₁ at steps of an ended episode; what comes after a time limit is in G as Q₁ has it."""
+        rewards = np.asarray(episode.rewards)
+        if self._vec_normalize_env is not None:  # as the critics learn them
+            rewards = self._vec_normalize_env.normalize_reward(rewards)
+        following = 0.0
+        if info.get("TimeLimit.truncated", False) and getattr(self.replay_buffer, "handle_timeout_termination", True):
+            last = info["terminal_observation"]
+            action, _ = self.predict(last, deterministic=True)
+            following = float(self._first_values([last], [action])[0])
+        returns = episode.returns(rewards, self.gamma, following)
+        return returns - self._first_values(episode.observations, episode.actions)
+
+    def _first_values(self, observations: list[Any], actions: list[np.ndarray]) -> np.ndarray:
+        """Q₁ (T,) of observations as the policy saw them, and actions as given to the environment."""
+        return predict_quantiles(self, observations, np.stack(actions))[:, 0].mean(dim=1).numpy()
+
+    def _calibrate(self, errors: np.ndarray) -> None:
+        assert self.calibrated is not None
+        self.calibrated, self.error_scale = calibrate(self.calibrated, self.error_scale, errors, self.least)
+        self.diagnose(lam_error=float(errors.mean()), lam_scale=self.error_scale)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_calibration"]
