@@ -1,5 +1,5 @@
 """
-What calibrating λ costs: ``python -m benchmarks.calibration`` prints its share of the time of a training.
+What calibrating λ costs: ``python -m benchmarks.calibration`` prints its share of training time.
 
 Processor time on one thread, on Hopper-v4 after a warm-up. Two whole trainings differ by more than this on a shared
 machine, so the calibration is timed where it happens.

@@ -32,6 +32,7 @@ from sb3_tdc.envs.rendering import (
     follow_agent,
     render_modes,
 )
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import MAX_SEED, RunSettings, check_settings
 from sb3_tdc.runs.trained import TrainedModel, open_run, open_zip
@@ -371,6 +372,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0
     """
+    know_ablations()
     parser = make_parser()
     args, given = parser.parse_args(argv), parser.parse_given(argv)
     try:

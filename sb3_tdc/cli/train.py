@@ -11,6 +11,7 @@ from sb3_tdc.cli.arguments import Parser, add_settings
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.diagnostics import NonFiniteError
 from sb3_tdc.common.output import harmless_output, warnings_as_sentences
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.resume import LockedError, NotRestoredError, stored_steps
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import RunSettings
@@ -71,6 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
+    know_ablations()
     parser = make_parser()
     settings, given = RunSettings(**vars(parser.parse_args(argv))), parser.parse_given(argv)
     start = time.monotonic()

@@ -121,7 +121,7 @@ class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._diagnostics.restart()
 
     def forget_episodes(self) -> None:
-        """Forget what is known of the episodes under way: the environments begin new ones."""
+        """Forget what a subclass knows of the episodes under way: the environments begin new ones."""
 
     def prepare_to_continue(self) -> None:
         """Make what a model that has been trained for some time has made, when a run is resumed."""

@@ -1,7 +1,8 @@
 """
 Variants of TDC that the experiments compare (docs/lambda.md), and that the package does not offer as options.
 
-Their names begin with that of TDC, whose hyperparameters they have. Only the commands of the experiments know them.
+Their names begin with that of TDC, whose hyperparameters they have. The commands know them, ``load_safely`` if it is
+told the class.
 """
 
 from typing import ClassVar
@@ -12,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.algorithms import ALGORITHMS
-from sb3_tdc.common.saved_fields import SavedField, number, or_none
+from sb3_tdc.common.saved_fields import SavedField, number
 from sb3_tdc.experiments.calibration import MAX_LAM, CalibratedTDC
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import Target
@@ -41,15 +42,14 @@ class PessimisticTDC(CalibratedTDC):
     """
 
     saved_fields: ClassVar[dict[str, SavedField]] = {
-        **CalibratedTDC.saved_fields,
-        "calibrated": SavedField(or_none(number(-MAX_LAM)), is_required=False),
+        "_calibrated": SavedField(number(-MAX_LAM, MAX_LAM), is_required=False)
     }
     least: ClassVar[float] = -MAX_LAM
 
     @property
     def pessimism(self) -> float:
         """β"""
-        return max(-(self.calibrated or 0.0), 0.0)
+        return max(-self.calibrated, 0.0)
 
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
         target = super().make_target(next_quantiles, replay_data, lam)
@@ -80,5 +80,5 @@ ABLATIONS: dict[str, type[OffPolicyAlgorithm]] = {
 
 
 def know_ablations() -> None:
-    """Let the commands of the experiments know the variants by name."""
+    """Let the commands know the variants by name."""
     ALGORITHMS.update(ABLATIONS)

@@ -1,5 +1,5 @@
 """
-TDC whose λ calibrates itself: returns of training episodes against the first critic's predictions.
+TDC that calibrates λ by comparing the returns of training episodes with the first critic's predictions.
 
 After ACC (Dorka et al. 2021); docs/lambda.md has the equations, and what was found.
 """
@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc.common.checks import Limits
 from sb3_tdc.common.returns import discounted_returns
-from sb3_tdc.common.saved_fields import SavedField, number, or_none
+from sb3_tdc.common.saved_fields import SavedField, number
 from sb3_tdc.critics.episodes import predict_quantiles
 from sb3_tdc.tdc import TDC
 
@@ -24,11 +24,11 @@ MAX_LAM = 10.0
 RATE = 0.1
 # The weight of the newest error in the moving average of their size
 SCALE_WEIGHT = 0.05
-# Steps whose returns are awaited, and updates, between two changes of λ
+# The least number of steps of ended episodes, and of updates, between two changes of λ
 PERIOD = 1_000
-# Steps of an episode between those whose values are predicted: neighbours tell the same
+# Steps of an episode between those whose values are predicted: neighbouring steps say much the same
 EVERY = 10
-# Of more environments, so many are followed
+# At most this many environments are followed
 MAX_FOLLOWED = 16
 # The longest horizon, 1/(1 − γ), for which a calibration waits in the beginning
 _MAX_HORIZON = 1_000
@@ -44,6 +44,7 @@ def calibrate(lam: float, scale: float, errors: np.ndarray, least: float) -> tup
     :param lam: λ
     :param scale: 0 before the first errors
     :param errors: G − Q₁
+    :param least: the smallest λ
     :return: λ and scale
     """
     size = float(np.abs(errors).mean())
@@ -76,7 +77,7 @@ class PendingEpisode:
         Add a step.
 
         :param observation: as the policy saw it, without a batch axis
-        :param action: as given to the environment
+        :param action: in [-1, 1]
         :param reward: as the environment gave it
         """
         if len(self.rewards) % EVERY == 0:
@@ -142,37 +143,47 @@ class CalibratedTDC(TDC):
     """
     TDC whose λ begins at ``lam``, rises after underestimation and falls after overestimation.
 
+    Another ``lam`` than the one that the calibration began at begins it anew.
+
     :param args: those of TDC
-    :param kwargs: those of TDC; ``lam`` is a number of at most 10
-    :ivar calibrated: what is calibrated; where it is not negative, λ
-    :ivar error_scale: moving average of |G − Q₁|; 0 before the first errors
+    :param kwargs: those of TDC; ``lam`` is a number from 0 to 10
     """
 
     limits: ClassVar[Limits] = {**TDC.limits, "lam": (0.0, MAX_LAM)}
     saved_fields: ClassVar[dict[str, SavedField]] = {
-        **TDC.saved_fields,
-        "calibrated": SavedField(or_none(number(0.0)), is_required=False),
-        "error_scale": SavedField(number(0.0), is_required=False),
+        "_calibrated": SavedField(number(0.0, MAX_LAM), is_required=False),
+        "_calibrated_from": SavedField(number(0.0, MAX_LAM), is_required=False),
+        "_error_scale": SavedField(number(0.0), is_required=False),
     }
     captured_attributes: ClassVar[tuple[str, ...]] = (*TDC.captured_attributes, "_calibration")
-    least: ClassVar[float] = 0.0  # of what is calibrated
-    calibrated: float | None = None
-    error_scale: float = 0.0
+    least: ClassVar[float] = 0.0
+    # Before the first calibration
+    _calibrated: float = 0.0
+    _calibrated_from: float | None = None
+    _error_scale: float = 0.0
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
         if callable(self.lam):
-            raise ValueError("lam must be a number here, where its calibration begins, got a schedule")
+            raise ValueError("lam must be a number, at which the calibration begins, got a schedule")
         self._check_limits("lam")
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if self.calibrated is None:
-            self.calibrated = float(self.lam)  # type: ignore[arg-type]  # not a schedule
         self._calibration = Calibration(self._n_updates)
 
+    @property
+    def calibrated(self) -> float:
+        """The calibrated number: λ where it is not negative."""
+        return self._calibrated if self._calibrated_from == self.lam else float(self.lam)  # type: ignore[arg-type]
+
+    @property
+    def error_scale(self) -> float:
+        """The moving average of |G − Q₁|; 0 before the first errors."""
+        return self._error_scale if self._calibrated_from == self.lam else 0.0
+
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
-        if name == "lam" and progress_remaining is None and self.calibrated is not None:
+        if name == "lam" and progress_remaining is None:
             return max(self.calibrated, 0.0)
         return super().scheduled(name, progress_remaining)
 
@@ -198,11 +209,11 @@ class CalibratedTDC(TDC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        self._follow_episodes(self.policy.unscale_action(buffer_action), reward, dones, infos)
+        self._follow_episodes(buffer_action, reward, dones, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _follow_episodes(
-        self, actions: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+        self, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
         """Add a step to the episodes, and change λ if enough of them have ended."""
         normalization, calibration = self._vec_normalize_env, self._calibration
@@ -210,7 +221,7 @@ class CalibratedTDC(TDC):
         observations: Any = self._last_obs
         for i, episode in calibration.episodes.items():
             one = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
-            episode.add(one, actions[i], float(rewards[i]))
+            episode.add(one, action[i], float(rewards[i]))
             if dones[i]:
                 counts = self._n_updates >= updates_before(self.tau, self.gamma)
                 calibration.end_episode(i, self._prediction_errors(episode, infos[i]) if counts else None)
@@ -228,18 +239,19 @@ class CalibratedTDC(TDC):
         if info.get("TimeLimit.truncated", False) and getattr(self.replay_buffer, "handle_timeout_termination", True):
             last = info["terminal_observation"]
             action, _ = self.predict(last, deterministic=True)
-            following = float(self._first_values([last], [action])[0])
+            following = float(self._first_values([last], action[None])[0])
         returns = episode.returns(rewards, self.gamma, following)
-        return returns - self._first_values(episode.observations, episode.actions)
+        actions = self.policy.unscale_action(np.stack(episode.actions))
+        return returns - self._first_values(episode.observations, actions)
 
-    def _first_values(self, observations: list[Any], actions: list[np.ndarray]) -> np.ndarray:
+    def _first_values(self, observations: list[Any], actions: np.ndarray) -> np.ndarray:
         """Q₁ (T,) of observations as the policy saw them, and actions as given to the environment."""
-        return predict_quantiles(self, observations, np.stack(actions))[:, 0].mean(dim=1).numpy()
+        return predict_quantiles(self, observations, actions)[:, 0].mean(dim=1).numpy()
 
     def _calibrate(self, errors: np.ndarray) -> None:
-        assert self.calibrated is not None
-        self.calibrated, self.error_scale = calibrate(self.calibrated, self.error_scale, errors, self.least)
-        self.diagnose(lam_error=float(errors.mean()), lam_scale=self.error_scale)
+        self._calibrated, self._error_scale = calibrate(self.calibrated, self.error_scale, errors, self.least)
+        self._calibrated_from = float(self.lam)  # type: ignore[arg-type]
+        self.diagnose(lam_error=float(errors.mean()), lam_scale=self._error_scale)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_calibration"]

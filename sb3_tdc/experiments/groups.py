@@ -167,11 +167,13 @@ def vary(groups: Iterable[Group], key: str) -> list[list[Group]]:
     return [sorted(some, key=lambda g: _sortable(g.setting(key))) for some in found.values() if len(some) > 1]
 
 
-def is_same_but(what: str, one: Group, other: Group) -> bool:
-    """Return whether two groups differ at most in one setting, or, for "algo", in the algorithm alone."""
-    if what == "algo":
-        return _identity(one.runs[0], algo=other.algo) == _identity(other.runs[0])
-    return _identity(one.runs[0], without=what) == _identity(other.runs[0], without=what)
+def have_same_settings(one: Group, other: Group, but: str | None = None) -> bool:
+    """
+    Return whether two groups have the same settings, whatever their algorithms.
+
+    :param but: a setting that may differ
+    """
+    return _identity(one.runs[0], but, algo=other.algo) == _identity(other.runs[0], but)
 
 
 def as_shipped(groups: Sequence[Group]) -> list[Group]:

@@ -14,12 +14,16 @@ from scipy import stats
 
 from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.ablations import ABLATIONS
-from sb3_tdc.experiments.groups import Group, by_conditions, is_same_but
+from sb3_tdc.experiments.groups import Group, by_conditions, have_same_settings
 from sb3_tdc.tdc import TDC
 
 _LEVEL = 0.05
 _NAMES = {cls: name for name, cls in {"tdc": TDC, **ABLATIONS}.items()}
-_PARENTS = {name: _NAMES[cls.__bases__[0]] for name, cls in ABLATIONS.items()}
+
+
+def _parent(algo: str) -> str:
+    """The algorithm that an ablation derives from."""
+    return next(_NAMES[base] for base in ABLATIONS[algo].__mro__[1:] if base in _NAMES)
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,8 @@ def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
     """
     Return the comparisons under all conditions.
 
-    λ is compared with λ = 0, and an ablation with the algorithm that it derives from, of the same hyperparameters.
+    λ, fixed or calibrated (``tdc-auto``), is compared with λ = 0, and another ablation with the algorithm that it
+    derives from, with the same hyperparameters.
     """
     found = []
     for alike in by_conditions(groups).values():
@@ -64,10 +69,16 @@ def _pairs(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
     finished = [group for group in groups if group.finished]
     for variant in finished:
         for control in (group for group in finished if group is not variant):
-            is_of_lam = variant.algo == "tdc" and control.setting("lam") == 0 and is_same_but("lam", variant, control)
-            is_ablation = control.algo == _PARENTS.get(variant.algo) and is_same_but("algo", variant, control)
-            if is_of_lam or is_ablation:
+            if _is_control(control, variant):
                 yield variant, control
+
+
+def _is_control(control: Group, variant: Group) -> bool:
+    if variant.algo in ("tdc", "tdc-auto"):
+        is_zero = control.algo == "tdc" and control.setting("lam") == 0
+        return is_zero and have_same_settings(variant, control, but="lam")
+    is_parent = variant.algo in ABLATIONS and control.algo == _parent(variant.algo)
+    return is_parent and have_same_settings(variant, control)
 
 
 def _compare(variant: Group, control: Group) -> Comparison:

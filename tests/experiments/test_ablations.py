@@ -6,6 +6,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.cli import enjoy, train
 from sb3_tdc.experiments.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC, know_ablations
 from sb3_tdc.experiments.calibration import CalibratedTDC
 from sb3_tdc.hyperparams import hyperparams_file
@@ -47,7 +48,7 @@ def test_the_shifted_target_is_lower_by_lam_standard_deviations():
 @pytest.mark.parametrize(("calibrated", "lam", "beta"), [(0.5, 0.5, 0.0), (-0.8, 0.0, 0.8), (0.0, 0.0, 0.0)])
 def test_below_zero_the_calibrated_number_is_pessimism(calibrated, lam, beta):
     model = make(PessimisticTDC, gamma=0.9)
-    model.calibrated = calibrated
+    model._calibrated, model._calibrated_from = calibrated, 1.0
     assert (model.scheduled("lam"), model.pessimism) == (lam, beta)
     batch, quantiles, found = targets(model, lam)
     mean, _, chosen = moments(quantiles, lam)
@@ -73,7 +74,6 @@ def test_overestimation_goes_on_into_pessimism_and_back():
     for error, expected in ((-1.0, -0.1), (-1.0, -0.2), (1.0, -0.1), (1.0, 0.0), (1.0, 0.1)):
         model._calibrate(np.array([error]))
         assert model.calibrated == pytest.approx(expected)
-    assert CalibratedTDC.least == 0.0
 
 
 def test_kappa_follows_the_errors_that_it_bounds():
@@ -93,17 +93,38 @@ def test_saved_and_opened(name, tmp_path):
     before = dict(ALGORITHMS)
     know_ablations()
     try:
-        model = make(ABLATIONS[name], lam=0.0)
-        model.learn(60)
-        if name == "tdc-pessimism":
-            model._calibrate(np.array([-1.0]))
-            assert model.pessimism == pytest.approx(0.1)
+        model = make(ABLATIONS[name], lam=0.0).learn(60)
+        if isinstance(model, CalibratedTDC):
+            model._calibrate(np.array([-1.0 if name == "tdc-pessimism" else 1.0]))
+            assert abs(model.calibrated) == pytest.approx(0.1)
         model.save(tmp_path / "model.zip")
         opened = load_model(tmp_path / "model.zip", name, None, False, device="cpu")
         assert type(opened) is ABLATIONS[name]
         assert opened.kappa == model.kappa
-        assert getattr(opened, "calibrated", None) == getattr(model, "calibrated", None)
+        for attribute in ("calibrated", "error_scale"):
+            assert getattr(opened, attribute, None) == getattr(model, attribute, None)
         assert hyperparams_file(name) == hyperparams_file("tdc")
     finally:
         ALGORITHMS.clear()
         ALGORITHMS.update(before)
+
+
+def test_the_commands_train_resume_and_play_them(tmp_path, capsys):
+    run = tmp_path / "tdc-shift" / "Pendulum-v1_1"
+    settings = ["-params", "learning_starts:20", "batch_size:16", "policy_kwargs:{net_arch: [8], n_quantiles: 5}"]
+    argv = [
+        "--algo",
+        "tdc-shift",
+        "--env",
+        "Pendulum-v1",
+        "-f",
+        str(tmp_path),
+        "--eval-freq",
+        "0",
+        "--resume-freq",
+        "40",
+    ]
+    assert train.main([*argv, "-n", "80", *settings]) == 0
+    assert train.main(["--resume", str(run), "--from", "40"]) == 0
+    assert enjoy.main([str(run), "--no-render", "--n-episodes", "1"]) == 0
+    assert "tdc-shift on Pendulum-v1" in capsys.readouterr().out

@@ -1,6 +1,7 @@
 """λ that calibrates itself: the direction, the units, what counts, and that it survives stopping."""
 
 import math
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_tdc import load_safely
 from sb3_tdc.common.returns import discounted_returns, known_steps
 from sb3_tdc.experiments import calibration
 from sb3_tdc.experiments.calibration import (
@@ -75,13 +77,30 @@ def test_no_error_is_no_division():
 
 @pytest.mark.parametrize("lam", [0.0, 0.5, 10.0])
 def test_where_it_begins(lam):
-    assert make_fast(lam=lam).scheduled("lam") == lam
+    model = make_fast(lam=lam)
+    assert (model.scheduled("lam"), model.calibrated) == (lam, lam)
 
 
-@pytest.mark.parametrize("lam", [-0.1, 10.1, math.nan, "auto", lambda progress: 1.0])
-def test_it_begins_at_a_number_up_to_10(lam):
-    with pytest.raises(ValueError, match=r"^lam.* must be"):
+@pytest.mark.parametrize(
+    ("lam", "message"),
+    [
+        (-0.1, "lam must be a finite number of at least 0.0, got -0.1"),
+        (10.1, "lam must be a finite number between 0.0 and 10.0, got 10.1"),
+        (math.nan, "lam must be a finite number of at least 0.0, got nan"),
+        ("auto", "lam must be a finite number of at least 0.0, got 'auto'"),
+        (lambda progress: 1.0, "lam must be a number, at which the calibration begins, got a schedule"),
+    ],
+)
+def test_it_begins_at_a_number_up_to_10(lam, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         make_fast(lam=lam)
+
+
+def test_lam_is_never_negative():
+    model = make_fast(lam=0.05).learn(10)
+    for _ in range(2):
+        model._calibrate(np.array([-1.0]))
+        assert model.calibrated == model.scheduled("lam") == 0
 
 
 def test_it_waits_until_values_can_have_their_size():
@@ -302,10 +321,35 @@ def test_it_is_saved_and_continues(tmp_path, short_period):
     value = model.scheduled("lam")
     assert value != 1
     model.save(tmp_path / "model.zip")
-    loaded = CalibratedTDC.load(tmp_path / "model.zip", env=TwoActions())
-    assert (loaded.lam, loaded.scheduled("lam"), loaded.error_scale) == (1.0, value, model.error_scale)
+    opened = (
+        CalibratedTDC.load(tmp_path / "model.zip"),
+        load_safely(tmp_path / "model.zip", algorithm=CalibratedTDC, device="cpu"),
+    )
+    for loaded in opened:
+        assert (loaded.lam, loaded.scheduled("lam"), loaded.error_scale) == (1.0, value, model.error_scale)
+        loaded.set_env(make_vec_env(TwoActions, 1))
+        loaded.learn(100, reset_num_timesteps=False)
+        assert loaded.scheduled("lam") != value
+
+
+def test_another_start_begins_anew(tmp_path, short_period):
+    model = make_fast().learn(200)
+    model.save(tmp_path / "model.zip")
+    loaded = CalibratedTDC.load(tmp_path / "model.zip", env=TwoActions(), lam=0.2)
+    assert (loaded.scheduled("lam"), loaded.error_scale) == (0.2, 0.0)
     loaded.learn(100, reset_num_timesteps=False)
-    assert loaded.scheduled("lam") != value
+    assert 0 <= loaded.scheduled("lam") < 0.9
+    model.lam = 3.0
+    assert model.scheduled("lam") == 3
+
+
+@pytest.mark.parametrize("field", ["_calibrated", "_calibrated_from"])
+def test_a_crafted_file_has_no_larger_lam(tmp_path, field):
+    model = make_fast()
+    vars(model)[field] = 1e300
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=rf"{field} must be a finite number from 0 to 10, got 1e\+300"):
+        load_safely(tmp_path / "model.zip", algorithm=CalibratedTDC)
 
 
 def lengths_of_episodes(monkeypatch):
@@ -361,7 +405,7 @@ def test_calibrating_changes_nothing_else(short_period):
     def calibrate_and_put_back(errors):
         CalibratedTDC._calibrate(held, errors)
         calibrated.append(held.calibrated)
-        held.calibrated = 0.5
+        held._calibrated = 0.5
 
     calibrated = []
     plain = make(TwoActions(), tau=1.0, gamma=0.5, lam=0.5, seed=3).learn(150)

@@ -9,6 +9,7 @@ from scipy import stats
 from sb3_tdc.experiments import sections, statistics, tables
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.experiments.suites import LAMBDA
 from sb3_tdc.experiments.variants import compare_variants
 from tests.helpers.run_folders import make_run
 
@@ -55,9 +56,20 @@ def test_each_variant_has_a_control_that_differs_in_one_thing(tmp_path):
         (("tdc", 0.5), ("tdc", 0.0)),
         (("tdc", "lin_1.0"), ("tdc", 0.0)),
         (("tdc-shift", 0.5), ("tdc", 0.5)),
-        (("tdc-auto", 0.5), ("tdc", 0.5)),
+        (("tdc-auto", 0.5), ("tdc", 0.0)),
         (("tdc-pessimism", 0.5), ("tdc-auto", 0.5)),
     }
+
+
+def test_the_suite_has_a_control_for_each_of_its_variants(tmp_path):
+    for cell in LAMBDA["lambda"]:
+        for seed in (1, 2):
+            make_run(tmp_path, cell.algo, cell.env_id, seed=seed, n_timesteps=400, returns=((seed,),), **cell.settings)
+    found = compare_variants(group_runs(find_runs(tmp_path)[0]))
+    pairs = {(c.control.conditions.env_id, c.variant.algo, c.variant.setting("lam"), c.control.algo) for c in found}
+    of_tdc = [("tdc", 0.5), ("tdc", 1.0), ("tdc-auto", 1.0), ("tdc-shift", 1.0), ("tdc-kappa", 1.0)]
+    expected = [*((*variant, "tdc") for variant in of_tdc), ("tdc-pessimism", 1.0, "tdc-auto")]
+    assert pairs == {(task, *each) for task in ("Hopper-v4", "HalfCheetah-v4") for each in expected}
 
 
 def test_the_difference_of_late_evaluations(tmp_path):
