@@ -9,12 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from sb3_tdc.cli import train
-from sb3_tdc.experiments.ablations import know_ablations
 
 
 def main(argv: Sequence[str]) -> int:
     """Return the exit status of ``sb3-tdc train``."""
-    know_ablations()
     keep_niceness()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     sys.orig_argv = ["sb3-tdc", "train", *argv]  # what to type to do the same, for the run's command.txt
