@@ -4,8 +4,10 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.cli.arguments import Parser
+from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.cli.arguments import Parser, one_of
 from sb3_tdc.common.untrusted import escaped
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load.inspect import inspect
 from sb3_tdc.safe_load.run_files import check_arguments, check_imports
@@ -30,7 +32,7 @@ def inspect_run(path: Path) -> tuple[list[str], bool]:
         lines, is_good = [*lines, f"Refused: {escaped(str(error))}"], False
     for model in [model for model in (run.model, run.best_model) if model.exists()]:
         try:
-            described, opens = inspect(model)
+            described, opens = inspect(model, ALGORITHMS.get(str(run.args.get("algo"))))
         except ValueError as error:
             described, opens = [f"Refused: {escaped(str(error))}"], False
         lines, is_good = [*lines, "", *described], is_good and opens
@@ -44,13 +46,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0 if all would be opened, 1 if something is refused, 2 if it is no such file
     """
+    know_ablations()
     parser = Parser("inspect", "Show what a saved file holds, what of it is code, and whether it would be opened.")
     parser.add_argument("path", type=Path, help=f"a {_KINDS}, or a run folder")
-    path = parser.parse_args(argv).path
+    parser.add_argument(
+        "--algo", type=one_of("algorithm", ALGORITHMS), help="of the zip of a model (default: the one of its policy)"
+    )
+    args = parser.parse_args(argv)
+    path = args.path
     if not path.exists():
         parser.fail(ValueError(f"{escaped(str(path))} does not exist"))
     try:
-        lines, is_good = inspect_run(path) if path.is_dir() else inspect(path)
+        lines, is_good = inspect_run(path) if path.is_dir() else inspect(path, ALGORITHMS.get(args.algo))
     except ValueError as error:
         expected = "" if path.is_dir() else f"; it must be a {_KINDS}"
         parser.fail(ValueError(f"{escaped(str(error))}{expected}"))

@@ -15,6 +15,7 @@ from sb3_tdc.common.files import check_can_be_made, lock, numbered, write_atomic
 from sb3_tdc.common.output import harmless_output
 from sb3_tdc.common.words import count
 from sb3_tdc.envs.registry import import_packages, split_env_id
+from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.jobs import Job, cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs
@@ -124,6 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, 1 if a trial failed, 130 if the user stopped the search
     """
+    know_ablations()
     parser = make_parser()
     args, given = parser.parse_args(argv), parser.parse_given(argv)
     try:

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
@@ -26,17 +27,17 @@ from sb3_tdc.safe_load.regular_files import open_regular
 _SHOWN = 12  # lines of each list
 
 
-_BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
+_PICKLED = {
+    pickled_name(kind) for kind in (VecNormalize, ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
+}
 
 
-_PICKLED = {pickled_name(kind) for kind in (VecNormalize, *_BUFFERS)}
-
-
-def inspect(path: Path) -> tuple[list[str], bool]:
+def inspect(path: Path, algorithm: type[OffPolicyAlgorithm] | None = None) -> tuple[list[str], bool]:
     """
     Describe a file without running, importing or unpickling anything of it.
 
     :param path: the zip of a model, ``VecNormalize`` statistics, a replay buffer
+    :param algorithm: of a model; None: by its policy
     :return: lines for the screen, and whether it would be opened
     :raises ValueError: if it is none of these
     """
@@ -48,7 +49,9 @@ def inspect(path: Path) -> tuple[list[str], bool]:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            model = load_safely(path, _stand_in(path, size), device="cpu", buffer_size=1)
+            model = load_safely(
+                path, _stand_in(path, size, algorithm), device="cpu", algorithm=algorithm, buffer_size=1
+            )
     except ValueError as error:
         return [*lines, f"Refused: {escaped(str(error).removeprefix(f'{path} was not opened: '))}"], False
     return [*lines, f"Would be opened as a {type(model).__name__} of {model.num_timesteps:,} steps."], True
@@ -61,7 +64,7 @@ class _StandIn(gym.Env):
         self.observation_space, self.action_space = fields["observation_space"], fields["action_space"]
 
 
-def _stand_in(path: Path, size: int) -> VecEnv | None:
+def _stand_in(path: Path, size: int, algorithm: type[OffPolicyAlgorithm] | None) -> VecEnv | None:
     """
     Return what a model with a hindsight buffer needs of its environment to be opened; None for all others.
 
@@ -73,7 +76,7 @@ def _stand_in(path: Path, size: int) -> VecEnv | None:
             entries = read_archive(file, MODEL_ENTRIES, budget)
         if "data" not in entries:
             return None
-        fields, _ = read_fields(entries["data"], {}, budget)
+        fields, _ = read_fields(entries["data"], {}, budget, algorithm)
     is_of_hindsight = fields.get("replay_buffer_class") is HerReplayBuffer
     return DummyVecEnv([lambda: _StandIn(fields)]) if is_of_hindsight and "action_space" in fields else None
 
@@ -105,11 +108,8 @@ def _describe_pickle(path: Path, size: int) -> tuple[list[str], bool]:
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             value = read_pickle(content, Budget(size))  # type: ignore[arg-type]  # a mapped file reads like a file
     kind = str(value.function) if isinstance(value, Call) else f"a {type(value).__name__}"
-    own = {value.function} if isinstance(value, Call) else set()
-    foreign = sorted(str(name) for name in names_in(value) - own if name not in {*CALLS, *CLASSES})
-    is_known = kind.rpartition(".")[2] in ("VecNormalize", "ReplayBuffer", "DictReplayBuffer", "HerReplayBuffer") or (
-        kind.endswith("NStepReplayBuffer")
-    )
+    is_known = isinstance(value, Call) and value.function in _PICKLED
+    foreign = sorted(str(name) for name in names_in(value) - {*CALLS, *CLASSES, *_PICKLED})
     verdict = (
         "Would be read as data, if it fits the environment." if is_known else f"Refused: {kind} is not known here."
     )

@@ -30,6 +30,8 @@ from stable_baselines3.her import GoalSelectionStrategy
 from sb3_tdc import TDC, UnsafeFileError, load_safely
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import enjoy, inspect
+from sb3_tdc.experiments.calibration import CalibratedTDC
+from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer
 from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import saved_fields
@@ -780,6 +782,32 @@ def test_statistics_buffers_and_folders_can_be_inspected(run, tmp_path, marker, 
     with pytest.raises(SystemExit):
         inspect.main([])
     assert not marker.exists()
+
+
+class ReplayBuffer:
+    """Of another module than SB3's, which SB3's own load would import."""
+
+
+def test_a_pickle_is_known_by_its_module_too(tmp_path, capsys):
+    (tmp_path / "buffer.pkl").write_bytes(pickle.dumps(ReplayBuffer()))
+    status, out = inspected(tmp_path / "buffer.pkl", capsys)
+    name = f"{ReplayBuffer.__module__}.ReplayBuffer"
+    assert (status, f"Refused: {name} is not known here." in out) == (1, True)
+    assert f"  {name}\n" in out
+
+
+def test_a_model_is_inspected_as_the_algorithm_that_is_named(tmp_path, capsys):
+    path = tmp_path / "model.zip"
+    model = CalibratedTDC("MlpPolicy", "Pendulum-v1", **TINY)
+    model._calibrate(np.array([1.0]))
+    model.save(path)
+    assert "Refused: the field '_calibrated' is unknown" in inspected(path, capsys)[1]
+    assert inspect.main([str(path), "--algo", "tdc-auto"]) == 0
+    assert "Would be opened as a CalibratedTDC of 0 steps." in capsys.readouterr().out
+    run = RunFolder.create(tmp_path, "tdc-auto", "Pendulum-v1")
+    run.write_config({"n_timesteps": 60}, {"algo": "tdc-auto", "env": "Pendulum-v1", "seed": 1, "gym_packages": []})
+    shutil.copy(path, run.model)
+    assert "Would be opened as a CalibratedTDC of 0 steps." in inspected(run.path, capsys)[1]
 
 
 def test_what_is_nothing_of_this_is_one_sentence(run, tmp_path, capsys):
