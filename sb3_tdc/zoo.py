@@ -109,10 +109,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     command, *arguments = argv
     relevant = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     relevant.add_argument("--algo")
-    relevant.add_argument("-conf", "--conf-file")
     chosen, _ = relevant.parse_known_args(arguments)
-    if command == "train" and chosen.algo in ("tdc", "meow") and chosen.conf_file is None:
-        arguments += ["-conf", str(hyperparams_file(chosen.algo))]
+    if command == "train" and chosen.algo in ("tdc", "meow"):
+        arguments = ["-conf", str(hyperparams_file(chosen.algo)), *arguments]  # the user's own comes later, and counts
     sys.argv = [f"sb3_tdc.zoo {command}", *arguments]  # RL Zoo reads its arguments from there
     {"train": train, "enjoy": enjoy}[command]()
 

@@ -4,6 +4,7 @@ import pytest
 
 from sb3_tdc import MEOW, TDC, zoo
 from sb3_tdc.cli import train as our_train
+from sb3_tdc.hyperparams import hyperparams_file
 
 rl_zoo3 = pytest.importorskip("rl_zoo3")
 
@@ -76,6 +77,22 @@ def test_it_says_how_to_install_rl_zoo(monkeypatch):
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     with pytest.raises(ImportError, match=r'pip install "sb3-tdc\[zoo\]"'):
         zoo.register()
+
+
+@pytest.mark.parametrize("flag", ["-conf", "--conf-file", "--conf"])
+def test_the_user_s_hyperparameters_count(monkeypatch, flag):
+    train = pytest.importorskip("rl_zoo3.train")
+    taken = []
+
+    def manager(*args, **kwargs):
+        taken.append(kwargs["config"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "ExperimentManager", manager)
+    for given, expected in (([flag, "my.yml"], "my.yml"), ([], str(hyperparams_file("tdc")))):
+        with pytest.raises(KeyboardInterrupt):
+            zoo.main(["train", "--algo", "tdc", "--env", "Pendulum-v1", *given])
+        assert taken.pop() == expected
 
 
 def test_usage():
