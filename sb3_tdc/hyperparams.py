@@ -57,6 +57,7 @@ _OPTIONS: dict[str, tuple[type, tuple[str, ...]]] = {
     "monitor_kwargs": (Monitor, ("env", "filename")),
 }
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
+_OF_NOISE = ("noise_type", "noise_std")
 
 
 @dataclass
@@ -155,6 +156,7 @@ def parse(
     :raises ValueError: naming the key, what it was, what is allowed, and the nearest known key
     """
     overrides = overrides or {}
+    entry = _without_other_noise(entry, overrides)
     hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _NO_HYPERPARAMETERS}
     hints.update(_RUN_KEYS)
     replaced = {key: value for key, value in entry.items() if key not in overrides}
@@ -172,7 +174,7 @@ def parse(
 
     if "n_timesteps" not in values:
         raise ValueError(f"{where}: n_timesteps is missing")
-    _check_noise(values, place("noise_type", "noise_std"))
+    _check_noise(values, place("action_noise", *_OF_NOISE))
     _convert_policy(values, algorithm, place("policy"), place("policy_kwargs"), limits)
     for key, (cls, others) in _OPTIONS.items():
         if isinstance(values.get(key), dict):
@@ -249,10 +251,23 @@ def _numbers_in(value: Any) -> Iterator[float]:
         yield value
 
 
+def _without_other_noise(entry: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    """Leave out the noise of an entry, where it is overridden in the other of the two ways to give it."""
+    if "action_noise" in overrides:
+        return {key: value for key, value in entry.items() if key not in _OF_NOISE}
+    if any(key in overrides for key in _OF_NOISE):
+        return {key: value for key, value in entry.items() if key != "action_noise"}
+    return entry
+
+
 def _check_noise(values: dict[str, Any], where: str) -> None:
     noise_type, sigmas = values.get("noise_type"), values.get("noise_std")
+    if "action_noise" in values and any(key in values for key in _OF_NOISE):
+        raise ValueError(f"{where}: the noise must be either action_noise, or noise_type and noise_std, got both")
     if noise_type not in (None, *_NOISE_TYPES):
         raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {noise_type!r}")
+    if noise_type is not None and sigmas is None:
+        raise ValueError(f"{where}: noise_type {noise_type} requires noise_std")
     if isinstance(sigmas, list) and (len(sigmas) != 2 or noise_type != "normal"):
         raise ValueError(f"{where}: noise_std must be a number, or two with noise_type normal, got {sigmas}")
 

@@ -179,6 +179,11 @@ def test_values_become_what_the_constructor_wants():
         ({"replay_buffer_class": "no.such.Buffer"}, "there is no module 'no'"),
         ({"policy": "MlpPolic"}, "unknown policy 'MlpPolic'; did you mean 'MlpPolicy'?"),
         ({"noise_type": "pink"}, "noise_type must be one of normal, ornstein-uhlenbeck, got 'pink'"),
+        ({"noise_type": "normal"}, "noise_type normal requires noise_std"),
+        (
+            {"noise_type": None, "action_noise": 0.1},
+            "must be either action_noise, or noise_type and noise_std",
+        ),
         ({"n_envs": 0}, "n_envs must be an integer of at least 1, got 0"),
         ({"noise_type": "normal", "noise_std": -0.1}, "noise_std must be a finite number of at least 0.0, got -0.1"),
         ({"noise_std": float("nan")}, "noise_std must be a finite number of at least 0.0, got nan"),
@@ -265,6 +270,11 @@ def test_what_depends_on_several_keys_is_checked_on_all_of_them_together():
     assert (h.noise_type, h.noise_std) == ("normal", [0.1, 0.4])
     assert h.raw == {**entry, **overrides}
     assert parse(entry, TDC, "file.yml", {"noise_type": None, "noise_std": 0}, "command line").noise_type is None
+    for overrides in ({"action_noise": 0.3}, {"action_noise": None}):
+        h = parse(entry, TDC, "file.yml", overrides, "command line")
+        assert (h.noise_type, h.model["action_noise"], "noise_std" in h.raw) == (None, overrides["action_noise"], False)
+    h = parse({"n_timesteps": 1, "action_noise": 0.3}, TDC, "file.yml", {"noise_type": None}, "command line")
+    assert (h.noise_type, "action_noise" in h.model) == (None, False)
     with pytest.raises(ValueError, match="command line: noise_std must be a number, or two with noise_type normal"):
         parse({**entry, "noise_std": [0.1, 0.4]}, TDC, "file.yml", {"noise_type": "ornstein-uhlenbeck"}, "command line")
 

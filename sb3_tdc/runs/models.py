@@ -129,11 +129,11 @@ def save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
 
 
 def _action_noise(hyperparams: Hyperparams, env: VecEnv) -> dict[str, Any]:
-    """Return the keyword argument for RL Zoo's ``noise_type``, if there is one."""
+    """Return the keyword argument for RL Zoo's ``noise_type``, if it is given; null is no noise."""
     if hyperparams.noise_type is None:
-        return {}
-    shape = env.action_space.shape
-    assert shape is not None
+        return {"action_noise": None} if "noise_type" in hyperparams.raw else {}
+    # Of actions without axes: what fits, added to those of one environment and of several, in SB3's classes too
+    shape = env.action_space.shape or ((1,) if env.num_envs == 1 else ())
     zeros, sigmas = np.zeros(shape), [np.full(shape, sigma) for sigma in np.atleast_1d(hyperparams.noise_std)]
     if hyperparams.noise_type != "normal":
         return {"action_noise": OrnsteinUhlenbeckActionNoise(zeros, sigmas[0])}
