@@ -1,10 +1,11 @@
-"""Gaussian exploration noise of many environments, drawn at once, and perhaps of another size in each."""
+"""Exploration noise: of many environments drawn at once, perhaps of another size in each, and of any action space."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_tdc.common.checks import check_number
 
@@ -52,13 +53,43 @@ class VectorizedNormalNoise(VectorizedActionNoise):
     def reset(self, indices: Iterable[int] | None = None) -> None:
         """Do nothing: what is drawn does not depend on what was drawn before."""
 
-    @property  # type: ignore[misc]
-    def noises(self) -> tuple[NormalActionNoise, ...]:  # type: ignore[override]
-        """The noise of every environment, of views of ``mean`` and ``sigma``."""
-        return tuple(NormalActionNoise(mean, sigma) for mean, sigma in zip(self.mean, self.sigma, strict=True))
+    @property  # type: ignore[override]
+    def noises(self) -> "tuple[_NoiseOfOne, ...]":
+        """The noise of every environment: what is changed of it changes ``mean`` and ``sigma``."""
+        return tuple(_NoiseOfOne(self, i) for i in range(self.n_envs))
+
+    @noises.setter  # type: ignore[override]
+    def noises(self, noises: Sequence[NormalActionNoise]) -> None:
+        if len(noises) != self.n_envs or not all(isinstance(noise, NormalActionNoise) for noise in noises):
+            raise ValueError(f"noises must be {self.n_envs} of NormalActionNoise, got {noises!r}")
+        self.mean[:], self.sigma[:] = [noise._mu for noise in noises], [noise._sigma for noise in noises]
 
     def __repr__(self) -> str:
         return f"VecNoise(BaseNoise={self.base_noise!r}), n_envs={self.n_envs})"
+
+
+class _NoiseOfOne(NormalActionNoise):
+    """The noise of one of several environments: a view of their ``mean`` and ``sigma``."""
+
+    def __init__(self, noise: VectorizedNormalNoise, index: int):
+        self.noise, self.index = noise, index
+        super().__init__(self._mu, self._sigma, noise.base_noise._dtype)  # type: ignore[attr-defined]
+
+    @property
+    def _mu(self) -> np.ndarray:
+        return self.noise.mean[self.index]
+
+    @_mu.setter
+    def _mu(self, mean: np.ndarray) -> None:
+        self.noise.mean[self.index] = mean
+
+    @property
+    def _sigma(self) -> np.ndarray:
+        return self.noise.sigma[self.index]
+
+    @_sigma.setter
+    def _sigma(self, sigma: np.ndarray) -> None:
+        self.noise.sigma[self.index] = sigma
 
 
 def noise_of_all(noise: ActionNoise, n_envs: int) -> ActionNoise:
@@ -69,3 +100,48 @@ def noise_of_all(noise: ActionNoise, n_envs: int) -> ActionNoise:
             return VectorizedNormalNoise(noise, n_envs)
         return VectorizedActionNoise(noise, n_envs)
     return noise
+
+
+class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """An off-policy algorithm whose ``action_noise`` may be a number, and fits any actions and environments."""
+
+    @property
+    def action_noise(self) -> ActionNoise | None:
+        """Exploration noise. A number put here becomes Gaussian noise, and noise of one environment that of all."""
+        return vars(self)["action_noise"]
+
+    @action_noise.setter
+    def action_noise(self, noise: ActionNoise | float | None) -> None:
+        n_envs, action_space = vars(self).get("n_envs", 1), vars(self).get("action_space")
+        if noise is not None and not isinstance(noise, ActionNoise):
+            sigma = check_number("action_noise (if not an ActionNoise or None)", noise, 0.0)
+            if action_space is not None:  # without one, a saved model is being loaded
+                shape = action_space.shape or (1,)
+                noise = NormalActionNoise(np.zeros(shape), np.full(shape, sigma))
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
+            noise = noise.base_noise
+        if type(noise) is NormalActionNoise and np.ndim(noise._mu) == np.ndim(noise._sigma) == 0:
+            # NumPy draws a number then, and SB3 calls a method of an array
+            noise = NormalActionNoise(np.atleast_1d(noise._mu), np.atleast_1d(noise._sigma), noise._dtype)
+        if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise):
+            noise = noise_of_all(noise, n_envs)
+        vars(self)["action_noise"] = noise
+
+    def _setup_model(self) -> None:
+        self.action_noise = self.action_noise  # a saved model's, for the environments of this one
+        super()._setup_model()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        scaled_action = self._sample_scaled_action(learning_starts, n_envs)
+        if action_noise is not None:
+            noise = action_noise()
+            if not self.action_space.shape:  # or (n,) and (n, 1) would be added to (n, n)
+                noise = noise.reshape(scaled_action.shape)
+            scaled_action = np.clip(scaled_action + noise, -1, 1)
+        return self.policy.unscale_action(scaled_action), scaled_action
+
+    def _sample_scaled_action(self, learning_starts: int, n_envs: int) -> np.ndarray:
+        """Return actions in [-1, 1], before the noise."""
+        return super()._sample_action(learning_starts, None, n_envs)[1]

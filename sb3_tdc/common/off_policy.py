@@ -10,7 +10,6 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_tdc.common.checks import (
@@ -22,11 +21,12 @@ from sb3_tdc.common.checks import (
     find_non_finite,
 )
 from sb3_tdc.common.diagnostics import Diagnostics, NonFiniteError
+from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
 
 
-class CheckedOffPolicyAlgorithm(OffPolicyAlgorithm):
+class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     """
     An off-policy algorithm whose arguments are checked, and which neither learns from nor saves what is not finite.
 

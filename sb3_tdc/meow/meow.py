@@ -90,7 +90,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         gamma: float = 0.99,
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
+        action_noise: ActionNoise | float | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
@@ -119,7 +119,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
             gamma,
             train_freq,
             gradient_steps,
-            action_noise=action_noise,
+            action_noise=action_noise,  # type: ignore[arg-type]  # a number becomes noise in its setter
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,

@@ -11,7 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
@@ -28,7 +28,6 @@ from sb3_tdc.common.checks import (
 )
 from sb3_tdc.common.dormant import dormant_share, relu_activations
 from sb3_tdc.common.layers import StackedLinear
-from sb3_tdc.common.noise import noise_of_all
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
 from sb3_tdc.common.versions import numba_version
@@ -190,7 +189,7 @@ class TDC(CheckedOffPolicyAlgorithm):
             gamma,
             train_freq,
             gradient_steps,
-            action_noise=action_noise,  # type: ignore[arg-type]  # a number becomes noise in the setter
+            action_noise=action_noise,  # type: ignore[arg-type]  # a number becomes noise in its setter
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
@@ -235,6 +234,8 @@ class TDC(CheckedOffPolicyAlgorithm):
         if self.target_entropy != "auto":
             check_number('target_entropy (if not "auto")', self.target_entropy)
         self._initial_ent_coef()
+        if "stochastic_actor" in self.policy_kwargs:
+            raise ValueError("stochastic_actor must be an argument of TDC itself, not one of policy_kwargs")
         saved = getattr(self, "_built_stochastic_actor", self.stochastic_actor)
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
@@ -266,7 +267,6 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        self.action_noise = self.action_noise  # a saved model's, for the environments of this one
         # The user's policy_kwargs stay theirs: SB3 compares them when a model is loaded
         policy_kwargs = self.policy_kwargs
         self.policy_kwargs = {**policy_kwargs, "stochastic_actor": self.stochastic_actor}
@@ -277,25 +277,6 @@ class TDC(CheckedOffPolicyAlgorithm):
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
         self._setup_fused_update()
         self._setup_temperature()
-
-    @property
-    def action_noise(self) -> ActionNoise | None:
-        """Exploration noise. A number put here becomes Gaussian noise, and noise of one environment that of all."""
-        return vars(self)["action_noise"]
-
-    @action_noise.setter
-    def action_noise(self, noise: ActionNoise | float | None) -> None:
-        n_envs, action_space = vars(self).get("n_envs", 1), vars(self).get("action_space")
-        if noise is not None and not isinstance(noise, ActionNoise):
-            sigma = check_number("action_noise (if not an ActionNoise or None)", noise, 0.0)
-            if action_space is not None:  # without one, a saved model is being loaded
-                shape = action_space.shape or (1,)
-                noise = NormalActionNoise(np.zeros(shape), np.full(shape, sigma))
-        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
-            noise = noise.base_noise
-        if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise):
-            noise = noise_of_all(noise, n_envs)
-        vars(self)["action_noise"] = noise
 
     def _setup_fused_update(self) -> None:
         self._fused_update: FusedUpdate | None = None
@@ -558,28 +539,21 @@ class TDC(CheckedOffPolicyAlgorithm):
         if not self._has_plain_units:
             return
         hidden = self.actor.latent_pi if self.stochastic_actor else self.actor.mu
-        observations = replay_data.observations.float().flatten(1)
-        of_actor, outputs = relu_activations(hidden, observations)  # type: ignore[arg-type]
+        observations = replay_data.observations
+        features = self.actor.extract_features(observations, self.actor.features_extractor)  # type: ignore[operator]
+        of_actor, outputs = relu_activations(hidden, features)  # type: ignore[arg-type]
         actions = self.actor.mu(outputs).tanh() if self.stochastic_actor else outputs  # type: ignore[operator]
-        of_critics, _ = relu_activations(self.critic.layers, th.cat([observations, actions.detach()], dim=1))
+        features = self.critic.extract_features(observations, self.critic.features_extractor)
+        of_critics, _ = relu_activations(self.critic.layers, th.cat([features, actions.detach()], dim=1))
         if of_actor and of_critics:
             self.diagnose(actor_dormant=dormant_share(of_actor), critic_dormant=dormant_share(of_critics))
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _sample_scaled_action(self, learning_starts: int, n_envs: int) -> np.ndarray:
         fused = self._fused_update
         if fused is None or self.num_timesteps < learning_starts or not fused.acts():
-            _, scaled_action = super()._sample_action(learning_starts, None, n_envs)
-        else:
-            scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
-            scaled_action = scaled_action.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
-        if action_noise is not None:
-            noise = action_noise()
-            if not self.action_space.shape:  # or (n,) and (n, 1) would be added to (n, n)
-                noise = noise.reshape(scaled_action.shape)
-            scaled_action = np.clip(scaled_action + noise, -1, 1)
-        return self.policy.unscale_action(scaled_action), scaled_action
+            return super()._sample_scaled_action(learning_starts, n_envs)
+        scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
+        return scaled_action.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
 
     def learn(
         self: SelfTDC,

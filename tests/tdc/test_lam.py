@@ -1,5 +1,6 @@
 """What λ does to the selection of the target critic, and which units are dormant: measured, and by hand."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -12,7 +13,7 @@ from sb3_tdc.common.dormant import dormant_share, relu_activations
 from sb3_tdc.tdc import tdc
 from sb3_tdc.tdc.lam import critical_lam, describe_selection
 from sb3_tdc.tdc.quantiles import Target, select_critic
-from tests.helpers.tdc import HEADS, make
+from tests.helpers.tdc import HEADS, TwoActions, make
 
 
 def target(mean, std, lam):
@@ -80,6 +81,36 @@ def test_activations_are_those_of_the_layers():
     (hidden,), output = relu_activations(layers, inputs)
     assert th.equal(hidden, layers[0](inputs).clamp(min=0))
     assert th.equal(output, layers[2](hidden))
+
+
+class Pixels(TwoActions):
+    """What SB3 divides by 255."""
+
+    observation_space = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
+
+    def reset(self, **kwargs):
+        _, info = super().reset(**kwargs)
+        return self.observation_space.sample(), info
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return self.observation_space.sample(), *rest
+
+
+def test_dormant_units_are_those_of_the_forward_pass():
+    model = make(Pixels()).learn(60)
+    with th.no_grad():
+        model.actor.mu[0].bias.sub_(0.2)
+    heard = []
+    hook = model.actor.mu[1].register_forward_hook(lambda module, inputs, output: heard.append(output))
+    batch = model.replay_buffer.sample(16)
+    model.actor(batch.observations)
+    hook.remove()
+    model.diagnose_units(batch)
+    found = model._diagnostics.fetch()["actor_dormant"]
+    second = model.actor.mu[3](model.actor.mu[2](heard[0]))
+    assert found == pytest.approx(dormant_share([heard[0], second]).item())
+    assert 0 < found < 1
 
 
 @HEADS

@@ -343,6 +343,10 @@ def test_diagnostics_by_hand():
             {"policy_kwargs": {"n_quantiles": 0}},
             r"policy_kwargs\['n_quantiles'\] must be an integer of at least 1, got 0",
         ),
+        (
+            {"policy_kwargs": {"stochastic_actor": True}},
+            "stochastic_actor must be an argument of TDC itself",
+        ),
         ({"policy_kwargs": {"n_critics": 0}}, r"policy_kwargs\['n_critics'\] must be an integer of at least 1, got 0"),
         ({"tau": 1.5}, "tau must be a finite number between 0.0 and 1.0, got 1.5"),
         ({"gamma": -0.5}, "gamma must be .* got -0.5"),
