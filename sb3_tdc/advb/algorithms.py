@@ -6,16 +6,16 @@ from typing import Any, ClassVar
 import numpy as np
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_tdc.advb import policies
 from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within
+from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, integer
 from sb3_tdc.tdc import TDC
 
 
-class Advised(OffPolicyAlgorithm):
+class Advised(NoisyOffPolicyAlgorithm):
     """
     An off-policy algorithm whose policy has a board. :class:`~sb3_tdc.advb.BoardCallback` fills it during training.
 
@@ -112,6 +112,16 @@ class AdvBTDC(Advised, TDC):
         super().train(gradient_steps, batch_size)
         self._advise_by_current_lam()
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Predict as TDC does; the board scores with the current λ."""
+        self._advise_by_current_lam()
+        return super().predict(observation, state, episode_start, deterministic)
+
     def _advise_by_current_lam(self) -> None:
-        policy: Any = self.policy
-        policy.lam = self.scheduled("lam")
+        self.policy.lam.fill_(self.scheduled("lam"))  # type: ignore[operator]

@@ -37,6 +37,7 @@ class Board(nn.Module):
         :param test_return: its return in a test episode
         :return: the seat that it gets, 0 for the best; None for none
         """
+        test_return = float(test_return)  # VecMonitor's are numbers of NumPy
         taken = self.returns[: len(self)].tolist()
         seat = next((i for i, other in enumerate(taken) if test_return > other), len(taken))
         if seat == len(self.members):

@@ -1,9 +1,11 @@
 """Test episodes that decide about the seats of a board."""
 
+import copy
+
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdc.advb.policies import AdvisedPolicy
 
@@ -14,8 +16,10 @@ class BoardCallback(BaseCallback):
 
     Test episodes cost steps that ``num_timesteps`` does not count: they are logged as ``board/test_steps``.
 
-    :param test_env: one separate environment, wrapped as that of the training
+    :param test_env: one separate environment, wrapped as that of the training; where that normalises, the test
+        environment gets its statistics, and leaves rewards as they are
     :param verbose: 1 prints every new member
+    :raises ValueError: when training begins, if only one of the two environments is wrapped in ``VecNormalize``
     """
 
     def __init__(self, test_env: VecEnv, verbose: int = 0):
@@ -25,6 +29,14 @@ class BoardCallback(BaseCallback):
         self.test_env = test_env
         self.test_steps = 0
 
+    def _init_callback(self) -> None:
+        training, self._normalization = self.model.get_vec_normalize_env(), unwrap_vec_normalize(self.test_env)
+        if (training is None) != (self._normalization is None):
+            where = "test_env" if training is None else "the training's environment"
+            raise ValueError(f"test_env must be wrapped as the training's environment, but only {where} is normalised")
+        if self._normalization is not None:
+            self._normalization.training = self._normalization.norm_reward = False
+
     def _on_step(self) -> bool:
         for _ in range(int(np.sum(self.locals["dones"]))):
             self._test_actor()
@@ -33,8 +45,7 @@ class BoardCallback(BaseCallback):
     def _test_actor(self) -> None:
         policy = self.model.policy
         assert isinstance(policy, AdvisedPolicy)
-        if isinstance(self.test_env, VecNormalize):
-            sync_envs_normalization(self.training_env, self.test_env)
+        self._synchronize_normalization()
         with policy.actor_alone():
             returns, lengths = evaluate_policy(
                 self.model, self.test_env, n_eval_episodes=1, return_episode_rewards=True, warn=False
@@ -48,3 +59,9 @@ class BoardCallback(BaseCallback):
         self.logger.record("board/test_steps", self.test_steps)
         self.logger.record("board/members", len(policy.board))
         self.logger.record("board/best_return", float(policy.board.returns[0]))
+
+    def _synchronize_normalization(self) -> None:
+        training = self.model.get_vec_normalize_env()
+        if training is not None:
+            for name in {"obs_rms", "ret_rms"} & vars(training).keys():
+                setattr(self._normalization, name, copy.deepcopy(getattr(training, name)))

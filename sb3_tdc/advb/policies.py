@@ -88,9 +88,13 @@ class SACMultiInputPolicy(AdvisedPolicy, sac.MultiInputPolicy):
 
 
 class RiskAdvisedPolicy(AdvisedPolicy):
-    """A board whose members are scored by quantile critics; ``lam`` is λ, which the algorithm sets."""
+    """A board whose members are scored by quantile critics; ``lam`` is λ, which the algorithm sets when it acts."""
 
-    lam = 0.0
+    lam: th.Tensor
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.register_buffer("lam", th.zeros(()))
 
     def score(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """

@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_tdc import load_safely
 from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
@@ -127,7 +127,7 @@ def test_the_actor_can_act_without_its_board(algorithm):
 @ALGORITHMS
 def test_without_members_the_actor_acts(algorithm):
     model = make(algorithm)
-    plain = algorithm.__mro__[2]  # SB3's
+    plain = algorithm.__bases__[1]  # SB3's
     expected = plain.policy_aliases["MlpPolicy"]._predict(model.policy, th.tensor(observations()), deterministic=True)
     with th.no_grad():
         assert np.allclose(model.policy._predict(th.tensor(observations()), deterministic=True), expected.detach())
@@ -210,6 +210,37 @@ def test_test_episodes_use_the_statistics_of_the_training():
 
 
 @ALGORITHMS
+def test_test_episodes_may_be_monitored_outside_the_normalisation(algorithm):
+    """Returns are then numbers of NumPy, and the statistics lie deeper."""
+    env, test_env = (VecMonitor(VecNormalize(make_vec_env(TwoActions, 1, seed=seed))) for seed in (1, 2))
+    make(algorithm, env=env).learn(40, callback=BoardCallback(test_env))
+    assert env.obs_rms.count - 7 <= test_env.obs_rms.count <= env.obs_rms.count  # since the last episode has ended
+
+
+def test_returns_of_test_episodes_are_not_normalised():
+    class Constant(TwoActions):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, -1.0, *rest
+
+    env, test_env = (VecNormalize(DummyVecEnv([Constant])) for _ in range(2))  # no Monitor, which would know them
+    model = make(env=env, n_members=20)
+    model.learn(40, callback=BoardCallback(test_env))
+    assert set(model.policy.board.returns[: len(model.policy.board)].tolist()) == {
+        -5.0
+    }  # of 5 steps: a test resets twice
+    assert test_env.obs_rms.count == pytest.approx(env.obs_rms.count, abs=10)  # its own steps are not in it
+
+
+@pytest.mark.parametrize("normalised", ["env", "test_env"])
+def test_one_normalised_environment_alone_is_refused(normalised):
+    envs = {name: make_vec_env(TwoActions, 1) for name in ("env", "test_env")}
+    envs[normalised] = VecNormalize(envs[normalised])
+    with pytest.raises(ValueError, match="test_env must be wrapped as the training's environment, but only"):
+        make(env=envs["env"]).learn(10, callback=BoardCallback(envs["test_env"]))
+
+
+@ALGORITHMS
 def test_a_board_is_saved_and_opened_with_its_model(tmp_path, algorithm):
     model = make(algorithm, formation_period=7)
     fill(model, [1.0, 3.0])
@@ -229,9 +260,9 @@ def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
     """The same weights as SB3's algorithm that begins with them, with a board that is filled beside it."""
     settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
     settings |= {"fused": False} if algorithm is AdvBTDC else {}  # the update of a custom policy class
-    plain = algorithm.__mro__[2]("MlpPolicy", TwoActions(), policy_kwargs={"net_arch": [8, 8]}, **settings)
+    plain = algorithm.__bases__[1]("MlpPolicy", TwoActions(), policy_kwargs={"net_arch": [8, 8]}, **settings)
     advised = make(algorithm, **settings)
-    names = [name for name in advised.policy.state_dict() if not name.startswith("board.")]
+    names = [name for name in advised.policy.state_dict() if not name.startswith(("board.", "lam"))]
     plain.policy.load_state_dict({name: advised.policy.state_dict()[name] for name in names})
     before = {name: advised.policy.state_dict()[name].clone() for name in names}
     results, test_env = [], make_vec_env(TwoActions, 1, seed=1)
@@ -253,8 +284,14 @@ def test_the_board_of_tdc_scores_with_the_current_lam(tmp_path):
     assert model.policy.lam == 1.0
     model.learn(20)
     assert model.policy.lam == pytest.approx(0.0, abs=1e-6)
-    make(AdvBTDC, lam=0.7).save(tmp_path / "model.zip")
+    model = make(AdvBTDC, lam=0.7)
+    model.save(tmp_path / "model.zip")
     assert [load(tmp_path / "model.zip").policy.lam for load in (AdvBTDC.load, load_safely)] == [0.7, 0.7]
+    model.policy.save(tmp_path / "policy.pth")
+    assert type(model.policy).load(tmp_path / "policy.pth").lam == 0.7
+    model.lam = 0.2
+    model.predict(observations())
+    assert model.policy.lam == 0.2
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Noise of many environments is what SB3 draws for one after the other."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,8 +8,10 @@ from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 
-from sb3_tdc import TDC, load_safely
+from sb3_tdc import MEOW, TDC, load_safely
+from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
 from sb3_tdc.common.noise import NormalNoiseRange, VectorizedNormalNoise, noise_of_all
+from tests.helpers.tdc import TwoActions
 
 
 @given(n_envs=st.integers(2, 40), n_actions=st.integers(1, 7), seed=st.integers(0, 1000), before=st.integers(0, 1))
@@ -41,6 +44,52 @@ def test_a_number_stands_for_all_actions(mean, sigma):
     expected = VectorizedActionNoise(one, 4)()
     np.random.seed(0)
     np.testing.assert_array_equal(noise_of_all(one, 4)(), expected)
+
+
+def test_the_noise_of_one_environment_can_be_changed():
+    noises = [
+        kind(NormalActionNoise(np.zeros(2), np.ones(2)), 3) for kind in (VectorizedActionNoise, VectorizedNormalNoise)
+    ]
+    for noise in noises:
+        noise.noises[1]._mu = np.full(2, 5.0)
+        noise.noises[2]._sigma *= 0.5  # as where noise decays
+        assert noise.noises[2]._sigma.tolist() == [0.5, 0.5]
+    drawn = []
+    for noise in noises:
+        np.random.seed(0)
+        drawn.append(noise())
+    np.testing.assert_array_equal(*drawn)
+    fast = noises[1]
+    fast.noises = [NormalActionNoise(np.zeros(2), np.full(2, sigma)) for sigma in (1, 2, 3)]
+    assert fast.sigma.tolist() == [[1, 1], [2, 2], [3, 3]]
+    with pytest.raises(ValueError, match="noises must be 3 of NormalActionNoise"):
+        fast.noises = fast.noises[:2]
+
+
+class Scalar(TwoActions):
+    action_space = gym.spaces.Box(-1.0, 1.0, (), np.float32)
+
+
+@pytest.mark.filterwarnings("ignore:You have specified an action space")
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("algorithm", [TDC, MEOW, AdvBTD3, AdvBSAC, AdvBTDC])
+@pytest.mark.parametrize("noise", [0.1, NormalActionNoise(np.zeros(()), np.full((), 0.1))])
+def test_noise_of_actions_without_axes(algorithm, n_envs, noise):
+    env = make_vec_env(Scalar, n_envs)  # which checks every action
+    settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
+    model = algorithm("MlpPolicy", env, action_noise=noise, **settings).learn(24)
+    assert model.replay_buffer.actions.shape[1:] == (n_envs, 1)
+
+
+@pytest.mark.parametrize("algorithm", [MEOW, AdvBTD3])
+def test_noise_fits_the_environments_that_a_model_is_opened_for(tmp_path, algorithm):
+    settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.1))
+    model = algorithm("MlpPolicy", make_vec_env(TwoActions, 3), action_noise=noise, **settings).learn(12)
+    model.save(tmp_path / "model")
+    for n_envs in (1, 2):
+        opened = algorithm.load(tmp_path / "model", env=make_vec_env(TwoActions, n_envs)).learn(20)
+        assert np.shape(opened.action_noise()) == ((2,) if n_envs == 1 else (2, 2))
 
 
 def test_a_subclass_that_draws_otherwise_keeps_its_own():
