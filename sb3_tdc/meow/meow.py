@@ -39,7 +39,8 @@ class MEOW(CheckedOffPolicyAlgorithm):
     :param train_freq: Update the model every ``train_freq`` steps, or ``(5, "step")``, ``(2, "episode")``
     :param gradient_steps: How many gradient steps to do after each rollout;
         -1: as many as steps done in the environment
-    :param action_noise: noise on top of the sampled action, None for none
+    :param action_noise: noise on top of the sampled action: an ``ActionNoise``, or the standard deviation of Gaussian
+        noise in normalised action units, or None for no noise
     :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
@@ -153,8 +154,6 @@ class MEOW(CheckedOffPolicyAlgorithm):
         self._check_arguments()
         super()._setup_model()
         self.network, self.network_target = self.policy.network, self.policy.network_target
-        self._running_statistics = get_parameters_by_name(self.network, ["running_"])
-        self._target_running_statistics = get_parameters_by_name(self.network_target, ["running_"])
 
     # ---------------------------------------------------------------- the update
 
@@ -170,6 +169,9 @@ class MEOW(CheckedOffPolicyAlgorithm):
         ent_coef = check_within(self.limits, "ent_coef", self.ent_coef)
         self.policy.set_training_mode(True)
         update_learning_rate(self.policy.optimizer, self.scheduled("learning_rate"))
+        statistics, target_statistics = (
+            get_parameters_by_name(network, ["running_"]) for network in (self.network, self.network_target)
+        )
 
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -186,7 +188,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
             self.policy.optimizer.step()
 
             polyak_update(self.network.parameters(), self.network_target.parameters(), self.tau)
-            polyak_update(self._running_statistics, self._target_running_statistics, 1.0)
+            polyak_update(statistics, target_statistics, 1.0)
             self.diagnose(
                 loss=loss.detach(),
                 grad_norm=grad_norm,
@@ -223,8 +225,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
 
     def _excluded_save_params(self) -> list[str]:
-        networks = ["network", "network_target", "_running_statistics", "_target_running_statistics"]
-        return [*super()._excluded_save_params(), *networks]
+        return [*super()._excluded_save_params(), "network", "network_target"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []

@@ -1,5 +1,8 @@
 """What users of SB3 rely on: their environments, observations, buffers, schedules and files."""
 
+import copy
+
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tdc import MEOW, NonFiniteError, UnsafeFileError, load_safely
-from tests.helpers.tdc import TwoActions
+from tests.helpers.tdc import BatchNormExtractor, TwoActions
 
 TINY = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
 SMALL_NETWORKS = {"net_arch": [8, 8], "shift_arch": [8, 8]}
@@ -183,3 +186,14 @@ def test_pendulum():
     model = MEOW("MlpPolicy", "Pendulum-v1", learning_starts=500, seed=0, device="cpu").learn(6_000)
     returns, _ = evaluate_policy(model, model.get_env(), n_eval_episodes=10, return_episode_rewards=True)
     assert np.mean(returns) > -300
+
+
+@pytest.mark.parametrize(
+    "copied", [lambda model: model, copy.deepcopy, lambda m: cloudpickle.loads(cloudpickle.dumps(m))]
+)
+def test_running_statistics_reach_the_target(copied):
+    model = copied(make(policy_kwargs={**SMALL_NETWORKS, "features_extractor_class": BatchNormExtractor}))
+    model.learn(40)
+    online, target = (network.features_extractor.net[1] for network in (model.network, model.network_target))
+    assert online.running_mean.abs().sum() > 0
+    assert th.equal(online.running_mean, target.running_mean)
