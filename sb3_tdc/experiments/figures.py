@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.plots import add_legend, style_axes
-from sb3_tdc.common.words import count
+from sb3_tdc.common.words import count, counted
 from sb3_tdc.experiments.published_curves import PublishedCurve
 from sb3_tdc.experiments.statistics import mean_interval
 
@@ -120,7 +120,8 @@ def draw_box_plots(
         box.set(facecolor=color, alpha=0.35)
     for position, color, r in zip(positions, colors, returns, strict=True):
         axes.scatter(np.full(len(r), position), r.mean(axis=1), color=color, edgecolor="black", lw=0.6, s=22, zorder=3)
-    style_axes(axes, title, "", f"return of {returns[0].shape[1]} test episodes a run")
+    episodes = sorted({r.shape[1] for r in returns})
+    style_axes(axes, title, "", f"return of {counted(episodes, 'test episode')} a run")
     width = max(10, 60 // max(len(labels), 1))
     ticks = [f"{wrap(label, width)}\n{count_seeds(len(r))}" for label, r in zip(labels, returns, strict=True)]
     axes.set_xticks(positions, ticks, fontsize="small")

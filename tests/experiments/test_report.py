@@ -121,6 +121,16 @@ def test_boxes_pool_episodes_and_dots_are_seeds():
     assert "2 seeds" in axes.get_xticklabels()[0].get_text()
 
 
+def test_boxes_of_different_numbers_of_episodes_are_labelled_with_all():
+    def label(*episodes):
+        returns = [np.arange(2.0 * n).reshape(2, n) for n in episodes]
+        colors = ["blue"] * len(episodes)
+        return draw(figures.draw_box_plots, [str(n) for n in episodes], colors, returns, "A").get_ylabel()
+
+    assert label(3, 3) == "return of 3 test episodes a run"
+    assert label(5, 2) == "return of 2 and 5 test episodes a run"
+
+
 LONG = "TDC, " + ", ".join(f"policy_kwargs.some_setting_{i} {i / 7}" for i in range(12))
 
 
