@@ -238,4 +238,6 @@ def _ablations(groups: Sequence[Group], key: str, *env_ids: str) -> list[list[Gr
 def _claim(says: str, quantity: Quantity, ours: Group, other: Group, verdict: Verdict) -> Claim:
     what, measure = quantity
     intervals = measure(ours), measure(other)
-    return Claim(says, ours, what, (ours.name, other.name), *intervals, verdict(*intervals))
+    is_measured = all(interval.n for interval in intervals)
+    found = verdict(*intervals) if is_measured else "undecided: too few values in the last third"
+    return Claim(says, ours, what, (ours.name, other.name), *intervals, found)

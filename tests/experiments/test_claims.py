@@ -135,7 +135,7 @@ def test_final_returns_and_spreads(tmp_path):
     assert against.verdict == "held"
     assert found["1", "mean", "TDC", "SAC"].verdict == "undecided"
     assert found["1", "mean", "TDC", "MEOW"].verdict == "undecided: too few seeds"
-    assert found["2", "scatter", "TDC", "SAC"].verdict == "undecided: too few seeds"  # of one evaluation each
+    assert found["2", "scatter", "TDC", "SAC"].verdict == "undecided: too few values in the last third"
     spreads = [c for c in examine_folder(tmp_path) if "over seeds" in c.what]
     assert {c.verdict for c in spreads} == {"undecided: too few seeds"}  # 1 [0.5, 6.3] and 500 [260, 3142], of three
 
