@@ -94,6 +94,15 @@ def area_under_curve(steps: np.ndarray, returns: np.ndarray) -> float:
     return float(integrate.trapezoid(means, steps) / (steps[-1] - steps[0])) if len(steps) > 1 else float(means[0])
 
 
+def mean(values: np.ndarray) -> float:
+    """
+    Return the mean across seeds; NaN where there are none.
+
+    :param values: (runs,)
+    """
+    return float(values.mean()) if len(values) else float("nan")
+
+
 def spread(values: np.ndarray) -> float:
     """
     Return the sample standard deviation across seeds; NaN for fewer than two.

@@ -56,8 +56,8 @@ def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
                 "best_std": statistics.spread(best),
                 "area_mean": area.mean(),
                 "area_std": statistics.spread(area),
-                "test_mean": tests.mean() if len(tests) else np.nan,
-                "test_std": statistics.spread(tests) if len(tests) else np.nan,
+                "test_mean": statistics.mean(tests),
+                "test_std": statistics.spread(tests),
                 "test_seeds": len(tests),
                 "test_episodes": min(map(len, tested), default=0),
             }
@@ -245,7 +245,7 @@ def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def _of_returns(group: Group, returns: np.ndarray) -> str:
-    mean = plus_minus(returns.mean(), statistics.spread(returns))
+    mean = plus_minus(statistics.mean(returns), statistics.spread(returns))
     return f"{group.name}: {mean} ({count(len(returns), 'seed')})"
 
 

@@ -31,8 +31,9 @@ class Comparison:
     """
     A variant and its control.
 
+    :param returns: (seeds with evaluations in the last third,) of the variant and of the control
     :param difference: of the means, variant − control, with its 95 % interval; NaN where there are too few seeds
-    :param p: corrected for the number of variants; NaN where there are too few seeds
+    :param p: corrected for the number of variants; NaN where there are too few seeds, or all returns are equal
     """
 
     variant: Group
@@ -43,9 +44,10 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        if np.isnan(self.p):
-            return "undecided: too few seeds"
-        if self.p >= _LEVEL:
+        fewest = min(map(len, self.returns))
+        if fewest < 2:
+            return "undecided: too few seeds" if fewest else "undecided: no evaluation in the last third"
+        if not self.p < _LEVEL:
             return "undecided"
         return "better" if self.difference[0] > 0 else "worse"
 
@@ -84,7 +86,7 @@ def _is_control(control: Group, variant: Group) -> bool:
 def _compare(variant: Group, control: Group) -> Comparison:
     """With the p-value of this comparison alone."""
     ours, others = variant.late_returns, control.late_returns
-    mean = float(ours.mean() - others.mean())
+    mean = statistics.mean(ours) - statistics.mean(others)
     if min(len(ours), len(others)) < 2:
         return Comparison(variant, control, (ours, others), (mean, np.nan, np.nan), np.nan)
     test = stats.ttest_ind(ours, others, equal_var=False)

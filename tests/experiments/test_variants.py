@@ -136,6 +136,27 @@ def test_one_seed_decides_nothing(tmp_path):
     assert (found.difference[0], found.verdict) == (1, "undecided: too few seeds")
 
 
+@pytest.mark.filterwarnings("error")
+def test_runs_without_late_evaluations_are_not_said_to_be_too_few(tmp_path):
+    for seed in (1, 2):
+        run = make_run(tmp_path, seed=seed, lam=0.5, returns=((3.0,), (4.0,)))
+        np.savez(run.path / "evaluations.npz", timesteps=[300, 600], results=[[3.0], [4.0]])  # of 1,000 steps
+    make_runs(tmp_path, [(1.0, 1.0), (3.0, 3.0)], lam=0.0)
+    (row,) = tables.make_variants_table(group_runs(find_runs(tmp_path)[0])).to_dict("records")
+    assert row["Variant"] == "TDC, λ 0.5: – (0 seeds)"
+    assert row["Control"].endswith("2 ± 1.4 (2 seeds)")
+    assert (row["Difference"], row["p"]) == ("–", "–")
+    assert row["Verdict"] == "undecided: no evaluation in the last third"
+
+
+@pytest.mark.filterwarnings("ignore:Precision loss")
+def test_equal_returns_decide_nothing(tmp_path):
+    for lam in (0.5, 0.0):
+        make_runs(tmp_path, [(7.0, 7.0), (7.0, 7.0), (7.0, 7.0)], lam=lam)
+    (found,) = compare(tmp_path).values()
+    assert (found.difference[0], found.verdict) == (0, "undecided")
+
+
 def test_a_schedule_has_its_curve_next_to_the_numbers(tmp_path):
     pytest.importorskip("matplotlib")
     for lam in (0.0, 0.5, "lin_1.0"):
