@@ -1,9 +1,10 @@
 """The report on a folder of runs: figures and tables, next to the paper's and other published results.
 
-One HTML file that needs no other, and the same figures (SVG, PNG, PDF) and tables (CSV) next to it. Reads only what
-runs have left; trains and plays nothing.
+One HTML file that needs no other, and the same figures (SVG, PNG, PDF) and tables (CSV) next to it, with a list of
+them. Reads only what runs have left; trains and plays nothing.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import Group, group_runs
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.sections import Report
+
+# What a report has written next to its page, one path a line: the next one removes these
+_LIST = "report_files.txt"
 
 
 def warnings(groups: Sequence[Group]) -> list[str]:
@@ -55,11 +59,11 @@ def _describe_board(group: Group) -> str:
 
 
 def _remove_old(folder: Path) -> None:
-    """Remove figures and tables of an earlier report: some may be of runs that are no longer there."""
-    if (folder / "report.html").is_file():
-        for pattern in ("figures/*.svg", "figures/*.png", "figures/*.pdf", "tables/*.csv"):
-            for path in folder.glob(pattern):
-                path.unlink()
+    """Remove figures and tables of an earlier report, and nothing else: some may be of runs that are gone."""
+    if (folder / _LIST).is_file():
+        for name in (folder / _LIST).read_text(encoding="utf-8").splitlines():
+            if re.fullmatch(r"(figures|tables)/[^/]+", name) and (folder / name).is_file():
+                (folder / name).unlink()
 
 
 def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -> Path:
@@ -104,4 +108,5 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
+    (folder / _LIST).write_text("".join(f"{name}\n" for name in report.files), encoding="utf-8")
     return path

@@ -53,8 +53,16 @@ class Report:
 
     def __init__(self, groups: Sequence[Group], folder: Path):
         self.groups, self.folder = groups, folder
+        self.files: list[str] = []  # written so far, relative to the folder
         self.returns = tables.make_returns_table(groups)
         self.conditions = by_conditions(groups, (*MUJOCO, *PYBULLET, *ISAAC))
+
+    def new_file(self, name: str) -> Path:
+        """Return where a file of the report is written, and remember it."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.files.append(name)
+        return path
 
     def draw(self, name: str, caption: str, function: Callable[..., None], *args: Any, **kwargs: Any) -> Picture:
         """Draw one figure by a function of axes and arrays, and write it as SVG, PNG and PDF."""
@@ -64,20 +72,17 @@ class Report:
         with matplotlib.rc_context({"font.size": 9, "svg.hashsalt": name}):
             figure = Figure(figsize=(4.8, 3.4), layout="constrained")
             function(figure.subplots(), *args, **kwargs)
-            path = self.folder / "figures" / re.sub(r"[^\w.-]+", "_", name)
-            path.parent.mkdir(parents=True, exist_ok=True)
+            file = re.sub(r"[^\w.-]+", "_", name)
             for suffix in ("png", "pdf"):
-                figure.savefig(f"{path}.{suffix}", dpi=200)
+                figure.savefig(self.new_file(f"figures/{file}.{suffix}"), dpi=200)
             svg = io.BytesIO()
             figure.savefig(svg, format="svg")
-        Path(f"{path}.svg").write_bytes(svg.getvalue())
-        return Picture(path.name, caption, base64.b64encode(svg.getvalue()).decode())
+        self.new_file(f"figures/{file}.svg").write_bytes(svg.getvalue())
+        return Picture(file, caption, base64.b64encode(svg.getvalue()).decode())
 
     def write_table(self, name: str, table: pd.DataFrame) -> None:
         """Write numbers as CSV."""
-        path = self.folder / "tables" / f"{name}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        table.to_csv(path, index=False)
+        table.to_csv(self.new_file(f"tables/{name}.csv"), index=False)
 
     def add_table(self, section: Section, name: str, table: pd.DataFrame, caption: str = "") -> None:
         """Write a table of cells to read, and show it; an empty one is left out."""

@@ -323,11 +323,15 @@ def test_an_earlier_report_leaves_nothing(tmp_path):
     make_run(tmp_path / "other", algo="td3")
     out = tmp_path / "out"
     report.write_report(*find_runs(tmp_path / "one"), out)
-    (out / "figures" / "mine.txt").write_text("kept")
+    mine = [out / "figures" / "mine.svg", out / "figures" / "mine.txt", out / "tables" / "mine.csv", out / "mine.csv"]
+    for path in mine:
+        path.write_text("kept")
+    with (out / "report_files.txt").open("a") as files:  # as someone else may have edited it
+        files.write("figures/../mine.csv\nmine.csv\n")
     assert any("td-error" in path.name for path in (out / "figures").iterdir())
     report.write_report(*find_runs(tmp_path / "other"), out)
     assert not any("td-error" in path.name for path in (out / "figures").iterdir())
-    assert (out / "figures" / "mine.txt").is_file()
+    assert [path.read_text() for path in mine] == ["kept"] * 4
     assert not (out / "tables" / "lambda.csv").exists()
 
 
