@@ -3,6 +3,7 @@
 A run keeps its place below the folder, so that the matrix finds it there and does not train it again.
 """
 
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -13,6 +14,7 @@ import pandas as pd
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.experiments import final_episodes as test_returns
 from sb3_tdc.experiments.results import Run
+from sb3_tdc.runs.settings import RunSettings, flags_of
 
 RESULTS = Path("results")
 _SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
@@ -20,6 +22,10 @@ _SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
 _ROWS = 150
 _COLUMNS = ("time/", "train/", "eval/", "board/", "rollout/ep_rew_mean")
 _LEFT_OUT = ("time/fps", "time/episodes", "time/critics_elapsed")
+
+# The flags of the log folder, and how they begin the word that holds it too
+_LOG_FOLDER = flags_of(RunSettings.__dataclass_fields__["log_folder"])
+_JOINED = re.compile(rf"^(-f|(?:{'|'.join(_LOG_FOLDER)})=).+", re.DOTALL)
 
 
 def publish(run: Run, logs: Path, folder: Path) -> Path:
@@ -41,7 +47,7 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     relative = str(place.relative_to(folder).parents[1])
     arguments = {**source.args, "log_folder": relative}
     (target / "args.yml").write_text(plain_yaml.dump(arguments))
-    command = _without_programs(run.command).replace(str(source.args["log_folder"]), relative)
+    command = _with_log_folder(_without_programs(run.command), relative)
     (target / "command.txt").write_text(f"{command}\n")
     (place / "progress.csv").unlink(missing_ok=True)
     if len(run.log):
@@ -62,6 +68,15 @@ def _without_programs(command: str) -> str:
     words = shlex.split(command)
     programs = [Path(word).name for word in words[:2]]
     return shlex.join([*(programs[1:] if programs[1:] == ["sb3-tdc"] else programs), *words[2:]])
+
+
+def _with_log_folder(command: str, folder: str) -> str:
+    """Return a command with another log folder, if it names one."""
+    words = shlex.split(command)
+    return shlex.join(
+        folder if before in _LOG_FOLDER else _JOINED.sub(lambda found: f"{found[1]}{folder}", word)
+        for before, word in zip(["", *words], words, strict=False)
+    )
 
 
 def _thin(log: pd.DataFrame) -> pd.DataFrame:

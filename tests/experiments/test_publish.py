@@ -1,5 +1,6 @@
 """What of a run is published, that a report made from it says the same, and that the matrix does not run it again."""
 
+import shlex
 import shutil
 import zipfile
 from contextlib import nullcontext
@@ -119,6 +120,22 @@ def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
 )
 def test_commands_name_no_folders_of_programs(command, published):
     assert publishing._without_programs(command) == published
+
+
+@pytest.mark.parametrize(
+    ("given", "published"),
+    [
+        *((f"{flag} .", [flag, "steps_5/seed 1"]) for flag in ("-f", "--folder", "--log-folder")),
+        ("--folder=.", ["--folder=steps_5/seed 1"]),
+        ("--log-folder=.", ["--log-folder=steps_5/seed 1"]),
+        ("-f.", ["-fsteps_5/seed 1"]),
+        ("", []),
+    ],
+)
+def test_the_log_folder_of_a_command_is_replaced_and_nothing_else(given, published):
+    command = f"python train.py {given} -n 500 -params lam:0.5 'env_wrapper:[a.B]'"
+    words = shlex.split(publishing._with_log_folder(command, "steps_5/seed 1"))
+    assert words == ["python", "train.py", *published, "-n", "500", "-params", "lam:0.5", "env_wrapper:[a.B]"]
 
 
 def test_test_returns_of_another_model_do_not_stay(logs, tmp_path):
