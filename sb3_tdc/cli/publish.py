@@ -18,7 +18,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Copy the small files of finished runs.
 
     :param argv: arguments, those of the process by default
-    :return: 0, or 1 if there is nothing to publish, or a finished run has not played its test episodes
+    :return: 0, or 1 if there is nothing to publish, a finished run has not played its test episodes, or another run is
+        in its place
     """
     know_ablations()
     parser = Parser(
@@ -37,15 +38,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     to_publish = [run for run in runs if run.is_finished and run.evaluations is not None]
     if not to_publish:
         print(f"Nothing to publish: {args.logs} has no run that is finished and evaluated", file=sys.stderr)
-    untested = []
+    untested, refused = [], []
     for run in to_publish:
-        place = publish(run, args.logs, args.output)
+        try:
+            place = publish(run, args.logs, args.output)
+        except ValueError as error:
+            refused.append(f"{run.folder.path} is not published: {error}")
+            continue
         size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
         print(f"{place}: {size / 1000:.0f} kB")
         if test_returns.read_test_returns(run) is None:
             untested.append(place)
-    for text in unreadable:
+    for text in [*unreadable, *refused]:
         print(text, file=sys.stderr)
     if untested:
         print(f"Without test episodes: {', '.join(map(str, untested))} ({command('evaluate', args.logs)})")
-    return int(bool(untested) or not to_publish)
+    return int(bool(untested or refused) or not to_publish)

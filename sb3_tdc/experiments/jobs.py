@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.experiments.results import Run, same_settings
+from sb3_tdc.experiments.results import Run, check_same_run
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.resume import DEFAULT_FREQ
 from sb3_tdc.resume.store import stored_steps
@@ -89,10 +89,7 @@ class Job:
         folder = RunFolder.open(newest.parents[1])
         here = {**folder.config, "seed": folder.args.get("seed"), "eval_freq": folder.args.get("eval_freq")}
         wanted = {**self.config, "seed": self.seed, "eval_freq": eval_freq(self.n_timesteps)}
-        differing = [k for k in {**here, **wanted} if not same_settings(here.get(k), wanted.get(k))]
-        if differing:
-            what = ", ".join(f"{key} {here.get(key)} instead of {wanted.get(key)}" for key in differing)
-            raise ValueError(f"{folder.path} is another run ({what}): move it away, or choose another folder")
+        check_same_run(folder.path, here, wanted)
         return folder
 
     @property

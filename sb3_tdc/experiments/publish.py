@@ -13,7 +13,7 @@ import pandas as pd
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.experiments import final_episodes as test_returns
-from sb3_tdc.experiments.results import Run
+from sb3_tdc.experiments.results import Run, check_same_run
 from sb3_tdc.runs.settings import RunSettings, flags_of
 
 RESULTS = Path("results")
@@ -36,8 +36,10 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     has is removed.
 
     :return: where they are
+    :raises ValueError: if something else than an earlier copy of the run is there
     """
     source, place = run.folder, folder / run.folder.path.relative_to(logs)
+    _check_is_copy(place, run)
     target = place / source.env_name
     target.mkdir(parents=True, exist_ok=True)
     _mirror(source.path / "evaluations.npz", place / "evaluations.npz")
@@ -53,6 +55,18 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     if len(run.log):
         _thin(run.log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
     return place
+
+
+def _check_is_copy(place: Path, run: Run) -> None:
+    """:raises ValueError: if there is a run in a place, and it is no earlier copy of the one to publish"""
+    if not any(place.glob("*/args.yml")):
+        return
+    there = Run.open(place)
+    if there.folder.model.is_file() or place.samefile(run.folder.path):
+        raise ValueError(f"{place} is itself a run, not the copy of one: choose another folder")
+    check_same_run(
+        place, *({"algo": one.algo, "env": one.env_id, "seed": one.seed, **one.settings} for one in (there, run))
+    )
 
 
 def _mirror(source: Path, target: Path, is_valid: bool = True) -> None:

@@ -251,6 +251,19 @@ def same_settings(one: Any, other: Any) -> bool:
     return canonical(one) == canonical(other)
 
 
+def check_same_run(path: Path, here: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """
+    Check that the run in a folder is the wanted one.
+
+    :param here: its settings; :param wanted: those of the wanted one
+    :raises ValueError: if it is another run, naming what differs
+    """
+    differing = [key for key in {**here, **wanted} if not same_settings(here.get(key), wanted.get(key))]
+    if differing:
+        what = ", ".join(f"{key} {here.get(key)} instead of {wanted.get(key)}" for key in differing)
+        raise ValueError(f"{path} is another run ({what}): move it away, or choose another folder")
+
+
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """``{"policy_kwargs": {"n_quantiles": 64}}`` → ``{"policy_kwargs.n_quantiles": 64}``."""
     flat: dict[str, Any] = {}

@@ -13,8 +13,9 @@ from sb3_tdc.cli import evaluate, matrix, publish, train
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.experiments import final_episodes, plan
 from sb3_tdc.experiments import publish as publishing
-from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.experiments.results import Run, find_runs
 from sb3_tdc.experiments.suites import SUITES, Cell
+from tests.helpers.run_folders import make_run
 
 
 @pytest.fixture(scope="module")
@@ -168,3 +169,50 @@ def test_results_are_not_published_over_the_runs(logs, capsys):
             publish.main([str(logs), "-o", str(output)])
         assert "-o must not lie in the folder of the runs" in capsys.readouterr().err
     assert before == {path: path.read_bytes() for path in logs.rglob("*") if path.is_file()}
+
+
+def finish(run, steps=1000):
+    """A run that takes its place in a folder of results without being trained."""
+    run.mark_finished(steps)
+    return run
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"), [({"seed": 2}, "seed 1 instead of 2"), ({"lam": 0.25}, "lam 1.0 instead of 0.25")]
+)
+def test_another_published_run_is_not_overwritten(tmp_path, capsys, changed, what):
+    finish(make_run(tmp_path / "one", lam=1.0))
+    finish(make_run(tmp_path / "other", **{"lam": 1.0, **changed}))
+    finish(make_run(tmp_path / "other", algo="td3"))
+    results = tmp_path / "results"
+    publish.main([str(tmp_path / "one"), "-o", str(results)])
+    before = contents(results)
+    capsys.readouterr()
+    assert publish.main([str(tmp_path / "other"), "-o", str(results)]) == 1
+    place = "tdc/Hopper-v4_1"
+    assert f"other/{place} is not published: {results}/{place} is another run ({what})" in capsys.readouterr().err
+    after = contents(results)
+    assert {path: after[path] for path in before} == before
+    assert (results / "td3" / "Hopper-v4_1" / "evaluations.npz").is_file()
+
+
+def test_a_run_is_published_again_with_what_it_has_by_now(tmp_path):
+    run = finish(make_run(tmp_path / "logs"))
+    assert publish.main([str(tmp_path / "logs"), "-o", str(tmp_path / "results")]) == 1  # without test episodes
+    checksum = final_episodes.checksum(Run.open(run.path))
+    np.savez(run.path / final_episodes.FILE, checksum=checksum, returns=[5.0, 6.0])
+    assert publish.main([str(tmp_path / "logs"), "-o", str(tmp_path / "results")]) == 0
+    assert final_episodes.read_test_returns(find_runs(tmp_path / "results")[0][0]).tolist() == [5, 6]
+
+
+def test_a_trained_run_is_not_overwritten_by_the_copy_of_its_repetition(tmp_path, capsys):
+    for logs in ("logs", "others"):
+        finish(make_run(tmp_path / logs))
+    before = contents(tmp_path / "others")
+    assert publish.main([str(tmp_path / "logs"), "-o", str(tmp_path / "others")]) == 1
+    assert "others/tdc/Hopper-v4_1 is itself a run, not the copy of one" in capsys.readouterr().err
+    assert contents(tmp_path / "others") == before
