@@ -6,6 +6,7 @@ A run keeps its place below the folder, so that the matrix finds it there and do
 import re
 import shlex
 import shutil
+from os.path import abspath
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +36,11 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     Test returns are copied if they are those of the model as it is now. What an earlier copy had and the run no longer
     has is removed.
 
+    :param logs: a folder above the run, or the run's own
     :return: where they are
     :raises ValueError: if something else than an earlier copy of the run is there
     """
-    source, place = run.folder, folder / run.folder.path.relative_to(logs)
+    source, place = run.folder, folder / _place(run, logs)
     _check_is_copy(place, run)
     target = place / source.env_name
     target.mkdir(parents=True, exist_ok=True)
@@ -55,6 +57,12 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     if len(run.log):
         _thin(run.log).to_csv(place / "progress.csv", index=False, float_format="%.6g")
     return place
+
+
+def _place(run: Run, logs: Path) -> Path:
+    """Return where a run lies below a folder of runs, with at least its ``<algo>/<environment>_<number>``."""
+    below = run.folder.path.relative_to(logs)
+    return below if len(below.parts) > 1 else Path(*Path(abspath(run.folder.path)).parts[-2:])
 
 
 def _check_is_copy(place: Path, run: Run) -> None:

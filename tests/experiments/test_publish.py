@@ -209,6 +209,26 @@ def test_a_run_is_published_again_with_what_it_has_by_now(tmp_path):
     assert final_episodes.read_test_returns(find_runs(tmp_path / "results")[0][0]).tolist() == [5, 6]
 
 
+@pytest.mark.parametrize("part", ["logs/tdc", "logs/tdc/Hopper-v4_1", "."])
+def test_a_part_of_a_log_folder_is_published_in_its_place(tmp_path, monkeypatch, part):
+    run = finish(make_run(tmp_path / "logs"))
+    monkeypatch.chdir(run.path if part == "." else tmp_path)
+    publish.main([part, "-o", str(tmp_path / "results")])
+    (published,), unreadable = find_runs(tmp_path / "results")
+    assert unreadable == []
+    assert published.folder.path == tmp_path / "results" / "tdc" / "Hopper-v4_1"
+    assert published.folder.args["log_folder"] == "."
+
+
+def test_a_run_is_not_published_over_itself(tmp_path, capsys):
+    run = finish(make_run(tmp_path / "logs", log={"train/lam": [1.0]}))
+    (run.path / "Hopper-v4.zip").unlink()  # as if it was published itself
+    before = contents(tmp_path)
+    assert publish.main([str(tmp_path / "logs" / "tdc"), "-o", str(tmp_path / "logs")]) == 1
+    assert "logs/tdc/Hopper-v4_1 is itself a run" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+
+
 def test_a_trained_run_is_not_overwritten_by_the_copy_of_its_repetition(tmp_path, capsys):
     for logs in ("logs", "others"):
         finish(make_run(tmp_path / logs))
