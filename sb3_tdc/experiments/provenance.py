@@ -84,7 +84,7 @@ def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFr
     for run in runs:
         if not run.is_complete or run.evaluations is None:
             if run.is_finished and not run.is_complete:
-                why = "a callback ended it early"
+                why = "finished early: a callback ended it, or n_timesteps was edited afterwards"
             elif run.is_finished:
                 why = "finished, but was not evaluated"
             elif run.folder.model.is_file():

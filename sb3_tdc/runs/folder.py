@@ -142,8 +142,12 @@ class RunFolder:
     @property
     def n_timesteps(self) -> int:
         """Environment steps that the run was to take; RL Zoo leaves those of ``-n`` out of its hyperparameters."""
-        given = self.args.get("n_timesteps", -1)
+        given = self.args.get("n_timesteps") if self._is_of_rl_zoo else None
         return int(given if isinstance(given, int) and given > 0 else self.config["n_timesteps"])
+
+    @property
+    def _is_of_rl_zoo(self) -> bool:
+        return "resume_freq" not in self.args
 
     @property
     def versions(self) -> dict[str, str]:
@@ -166,8 +170,7 @@ class RunFolder:
         if self._finished.is_file():
             return True
         # RL Zoo does not say: its run is finished if the model has all steps
-        is_of_rl_zoo = "resume_freq" not in self.args
-        return is_of_rl_zoo and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
+        return self._is_of_rl_zoo and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
 
     def steps_of_model(self) -> int:
         """

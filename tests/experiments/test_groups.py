@@ -96,7 +96,10 @@ def test_a_run_that_a_callback_ended_is_finished_for_all_but_not_averaged(tmp_pa
     (group,) = group_runs([run])
     assert group.finished == ()
     (row,) = list_unfinished([run], []).to_dict("records")
-    assert (row["Steps"], row["Why"]) == ("400 of 1,000", "a callback ended it early")
+    assert (row["Steps"], row["Why"]) == (
+        "400 of 1,000",
+        "finished early: a callback ended it, or n_timesteps was edited afterwards",
+    )
 
 
 def test_runs_with_other_contacts_are_not_averaged(tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import find_runs
 from tests.helpers.run_folders import make_run
@@ -40,6 +41,17 @@ def test_a_run_of_rl_zoo_with_other_steps_on_its_command_line(tmp_path):
     runs, _ = find_runs(tmp_path)
     assert [(run.n_timesteps, run.is_finished) for run in runs] == [(300, True), (1000, False)]
     assert len(group_runs(runs)) == 2  # another number of steps is another experiment
+
+
+def test_the_steps_in_force_are_those_of_the_edited_config(tmp_path):
+    """Of a run that was begun with ``-n 1000``, shortened to 600 steps before it was resumed, and has taken these."""
+    args = {"n_timesteps": 1000, "resume_freq": None}
+    run = make_run(tmp_path, steps=600, n_timesteps=600, args=args, returns=((1.0,), (3.0,)))  # at 300 and 600
+    run.mark_finished(600)
+    (found,), _ = find_runs(tmp_path)
+    assert (found.n_timesteps, found.settings["n_timesteps"], found.is_complete) == (600, 600, True)
+    assert found.late_evaluations().tolist() == [3]
+    assert len(provenance.list_unfinished([found], [])) == 0
 
 
 def test_of_several_folders_the_last_counts(tmp_path):
