@@ -2,10 +2,12 @@
 
 import inspect
 import json
+import os
 import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -181,14 +183,15 @@ class Run:
 
 def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
     """
-    Find every run below some folders.
+    Find every run below some folders, also through links.
 
     :return: every run, folder after folder, in the order of its path, and a sentence for each that cannot be read
     :raises ValueError: if there is none below one of the folders
     """
     runs, unreadable = [], []
     for folder in folders:
-        paths = sorted({config.parent.parent for config in folder.rglob("*/config.yml")}, key=_by_number)
+        configs = (below / "config.yml" for below in _folders_below(folder))
+        paths = sorted({config.parents[1] for config in configs if config.is_file()}, key=_by_number)
         if not paths:
             reason = "no <algorithm>/<environment>_<number>/<environment>/config.yml"
             raise ValueError(f"There are no runs in {folder}: {reason}")
@@ -200,6 +203,21 @@ def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
     if not runs:
         raise ValueError(f"There are no runs in {', '.join(map(str, folders))}: {'; '.join(unreadable)}")
     return runs, unreadable
+
+
+def _folders_below(folder: Path) -> Iterator[Path]:
+    """Yield every folder below one, once; links are followed last, so that what they lead to has its own path."""
+    waiting, seen = deque([folder]), set()
+    while waiting:
+        for name, folders, _ in os.walk(waiting.popleft()):
+            path = Path(name)
+            if (real := path.resolve()) in seen:
+                folders.clear()
+                continue
+            seen.add(real)
+            waiting.extend(path / each for each in sorted(folders) if (path / each).is_symlink())
+            if path != folder:
+                yield path
 
 
 def _by_number(path: Path) -> tuple[Path, str, int]:

@@ -54,6 +54,26 @@ def test_the_steps_in_force_are_those_of_the_edited_config(tmp_path):
     assert len(provenance.list_unfinished([found], [])) == 0
 
 
+def test_runs_behind_links_are_found_once(tmp_path):
+    logs, disk = tmp_path / "logs", tmp_path / "disk"
+    make_run(logs, seed=1)
+    make_run(disk, seed=2)
+    make_run(disk, seed=3, algo="sac")
+    (logs / "tdc" / "Hopper-v4_2").symlink_to(disk / "tdc" / "Hopper-v4_1")
+    (logs / "sac").symlink_to(disk / "sac")
+    (logs / "a_second_time").symlink_to(logs / "tdc" / "Hopper-v4_1")
+    (logs / "tdc" / "loop").symlink_to(logs)
+    (disk / "sac" / "loop").symlink_to(tmp_path / "logs")
+    (logs / "nowhere").symlink_to(tmp_path / "nowhere")
+    runs, unreadable = find_runs(logs)
+    assert unreadable == []
+    assert [(str(run.folder.path.relative_to(logs)), run.seed) for run in runs] == [
+        ("sac/Hopper-v4_1", 3),
+        ("tdc/Hopper-v4_1", 1),
+        ("tdc/Hopper-v4_2", 2),
+    ]
+
+
 def test_of_several_folders_the_last_counts(tmp_path):
     make_run(tmp_path / "results", seed=1, returns=((1.0,),))
     make_run(tmp_path / "logs", seed=1, returns=((2.0,),))
