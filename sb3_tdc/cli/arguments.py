@@ -1,6 +1,7 @@
 """Parsing that the commands share."""
 
 import argparse
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, fields
 from pathlib import Path
@@ -101,6 +102,18 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
         return name
 
     return check
+
+
+def add_trust(parser: Parser) -> None:
+    """Add ``--trust``, of commands that load saved models."""
+    help = "let the files run code, as SB3 does: only if you know their origin"
+    parser.add_argument("--trust", action="store_true", help=help)
+
+
+def warn_of_trust(is_given: bool) -> None:
+    """Say what ``--trust`` means, if it is given."""
+    if is_given:
+        print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
 
 
 def add_settings(parser: Parser, names: Iterable[str] = ()) -> None:

@@ -1,7 +1,6 @@
 """``sb3-tdc enjoy logs/tdc/Walker2d-v4_1``: watch, record or explain a trained agent."""
 
 import argparse
-import sys
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
@@ -16,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdc.advb.policies import AdvisedPolicy
 from sb3_tdc.algorithms import ALGORITHMS
-from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_of_trust
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.returns import steps_until_negligible
 from sb3_tdc.common.threads import set_threads
@@ -81,11 +80,7 @@ def make_parser() -> Parser:
     )
     add("--board", action="store_true", help="actions of the advisory board (AdvB) instead of those of the actor alone")
     add("--seed", type=int, default=0, help="seed of the environment")
-    add(
-        "--trust",
-        action="store_true",
-        help="let the files run code, as SB3 does: only if you know their origin",
-    )
+    add_trust(parser)
     add("--verbose", type=int, default=1, help="0: only the result, 1: every episode")
     return parser
 
@@ -318,8 +313,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
 
 def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
     args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
-    if args.trust:
-        print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
+    warn_of_trust(args.trust)
     _check_arguments(args)
     set_threads(args.num_threads)
     trained = find_trained(args, given)

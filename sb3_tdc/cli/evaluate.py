@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_of_trust
 from sb3_tdc.common.words import count
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
@@ -23,6 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("logs", type=Path, help="folder of runs")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes for each run")
     add_settings(parser, ["gym_packages"])
+    add_trust(parser)
     args = parser.parse_args(argv)
     if args.episodes < 1:
         parser.fail(ValueError(f"--episodes must be at least 1, got {args.episodes}"))
@@ -30,13 +31,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         runs, unreadable = find_runs(args.logs)
     except ValueError as error:
         parser.fail(error)
+    warn_of_trust(args.trust)
     failed = list(unreadable)
     for run in runs:
         if not run.is_finished:
             print(f"{run.folder.path}: left out, at step {run.steps:,} of {run.n_timesteps:,}")
             continue
         try:
-            returns = measure_run(run, args.episodes, args.gym_packages)
+            returns = measure_run(run, args.episodes, args.gym_packages, args.trust)
         except Exception as error:  # one run must not stop the others
             failed.append(f"{run.folder.path}: {type(error).__name__}: {' '.join(str(error).split())}")
             continue

@@ -64,11 +64,12 @@ def read_test_returns(run: Run) -> np.ndarray | None:
     return returns if not run.folder.model.is_file() or str(tested) == checksum(run) else None
 
 
-def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()) -> np.ndarray:
+def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = (), trust: bool = False) -> np.ndarray:
     """
     Play the episodes and keep their returns, unless they are kept already.
 
     :param packages: those that a run may import, to register its environment
+    :param trust: whether its files may run code
     :return: (episodes,)
     :raises ValueError: if the run cannot be loaded, or its returns cannot be written
     """
@@ -78,7 +79,7 @@ def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()
     path = run.folder.path / FILE
     check_writable("Test returns:", path)
     before = checksum(run)
-    trained = open_run(run.folder, run.folder.model, packages)
+    trained = open_run(run.folder, run.folder.model, packages, trust)
     env = trained.make_env(FIRST_SEED, **(trained.eval_env_kwargs or trained.env_kwargs))
     with closing(env):
         returns = play_final_episodes(trained.load(env, "cpu"), env, episodes)

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import pytest
 from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import evaluate, train
@@ -37,6 +38,24 @@ def test_a_model_that_needs_its_environment_to_be_loaded(tmp_path):
             total, done = total + reward, terminated or truncated
         expected.append(total)
     assert read_test_returns(run).tolist() == expected
+
+
+class OwnExtractor(FlattenExtractor):
+    """A class that saved models may not name."""
+
+
+def test_a_model_with_a_class_of_the_user_is_tested_if_it_is_trusted(tmp_path, capsys):
+    kwargs = f"{{net_arch: [8], n_quantiles: 4, features_extractor_class: {__name__}.OwnExtractor}}"
+    arguments = ["--env", "Pendulum-v1", "-n", "30", "--eval-freq", "-1", "-f", str(tmp_path), "--verbose", "0"]
+    assert train.main([*arguments, "-params", *SMALL, f"policy_kwargs:{kwargs}"]) == 0
+    capsys.readouterr()
+    assert evaluate.main([str(tmp_path), "--episodes", "1"]) == 1
+    assert "OwnExtractor" in capsys.readouterr().err
+    run = Run.open(tmp_path / "tdc" / "Pendulum-v1_1")
+    assert read_test_returns(run) is None
+    assert evaluate.main([str(tmp_path), "--episodes", "1", "--trust"]) == 0
+    assert "--trust: whatever code these files hold runs with your rights" in capsys.readouterr().err
+    assert len(read_test_returns(run)) == 1
 
 
 def test_nothing_is_played_whose_returns_cannot_be_written(tmp_path, monkeypatch):
