@@ -1,16 +1,18 @@
 """``sb3-tdc publish LOGS``: copy the small files of finished runs into a folder that can be committed."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made
+from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.experiments import final_episodes as test_returns
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.publish import RESULTS, publish
-from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.experiments.results import Run, find_runs
+from sb3_tdc.safe_load.run_files import packages_of
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     to_publish = [run for run in runs if run.is_finished and run.evaluations is not None]
     if not to_publish:
         print(f"Nothing to publish: {args.logs} has no run that is finished and evaluated", file=sys.stderr)
-    untested, refused = [], []
+    untested: dict[Path, Run] = {}
+    refused = []
     for run in to_publish:
         try:
             place = publish(run, args.logs, args.output)
@@ -48,9 +51,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
         print(f"{place}: {size / 1000:.0f} kB")
         if test_returns.read_test_returns(run) is None:
-            untested.append(place)
+            untested[place] = run
     for text in [*unreadable, *refused]:
         print(text, file=sys.stderr)
     if untested:
-        print(f"Without test episodes: {', '.join(map(str, untested))} ({command('evaluate', args.logs)})")
+        play = _command_to_evaluate(args.logs, untested.values())
+        print(f"Without test episodes: {', '.join(map(str, untested))} ({play})")
     return int(bool(untested or refused) or not to_publish)
+
+
+def _command_to_evaluate(logs: Path, runs: Iterable[Run]) -> str:
+    """Return the command that plays the test episodes of runs, with the packages that these ask for."""
+    packages = dict.fromkeys(escaped(str(name)) for run in runs for name in packages_of(run.folder.args))
+    return command("evaluate", logs, *(["--gym-packages", *packages] if packages else []))

@@ -59,6 +59,16 @@ def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where:
         raise ValueError(f"{where}: algo must be one of {', '.join(algorithms)}, got {shown(args['algo'])}")
 
 
+def packages_of(args: Mapping[str, Any]) -> list[str]:
+    """
+    Return the packages that a run asks for, to register its environment.
+
+    :param args: of ``args.yml``
+    """
+    package, _, _ = args["env"].rpartition(":")
+    return [*(args.get("gym_packages") or []), *([package] if package else [])]
+
+
 def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str], where: str) -> None:
     """
     Check that the files of a run name no code but what is known or consented to.
@@ -68,8 +78,7 @@ def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented:
     :param consented: packages and modules that the user has named
     :raises ValueError: if the files name code to import that is neither known to be harmless nor consented to
     """
-    package, _, _ = args["env"].rpartition(":")
-    for name in [*args["gym_packages"], *([package] if package else [])]:
+    for name in packages_of(args):
         if name not in consented:
             raise ValueError(
                 f"{where} asks for the package {escaped(name)}: if you know it, add --gym-packages {escaped(name)}"

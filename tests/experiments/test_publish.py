@@ -110,6 +110,13 @@ def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
     assert "Without test episodes" in capsys.readouterr().out
 
 
+def test_the_command_that_plays_them_names_the_packages_of_the_runs(tmp_path, capsys):
+    for seed, args in enumerate(({"gym_packages": ["one", "two"]}, {"gym_packages": ["one"]}, {}), 1):
+        finish(make_run(tmp_path / "logs", seed=seed, args=args))
+    publish.main([str(tmp_path / "logs"), "-o", str(tmp_path / "results")])
+    assert f" evaluate {tmp_path}/logs --gym-packages one two)\n" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("command", "published"),
     [
