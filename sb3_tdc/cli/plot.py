@@ -1,7 +1,9 @@
 """``sb3-tdc plot RUN [RUN ...]``: learning curves of runs, from their evaluations."""
 
+import os
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ class Evaluated:
     """
     The evaluations of one run.
 
-    :param label: algorithm and seed
+    :param label: algorithm and seed, and the folder where several have these in common
     :param timesteps: (evaluations,)
     :param returns: (evaluations, episodes)
     """
@@ -51,6 +53,22 @@ def load_curve(run: RunFolder, until: int | None = None) -> Evaluated:
     return Evaluated(f"{args['algo']}, seed {args['seed']}", args["env"], timesteps[shown], returns[shown])
 
 
+def load_curves(runs: Sequence[Path], until: int | None = None) -> list[Evaluated]:
+    """
+    Read the evaluations of runs; those of one label have their folders too, as far as these differ.
+
+    :raises ValueError: as :func:`load_curve`, or if a folder is not one of a run
+    """
+    curves = [load_curve(RunFolder.open(run), until) for run in runs]
+    times = Counter(curve.label for curve in curves)
+    folders = [os.path.abspath(run) for run in runs]
+    names = [os.path.relpath(folder, os.path.commonpath(folders)) for folder in folders]
+    return [
+        replace(curve, label=f"{curve.label} ({name})") if times[curve.label] > 1 else curve
+        for curve, name in zip(curves, names, strict=True)
+    ]
+
+
 def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
     """
     One line a run, the mean over the episodes of each evaluation; the episodes are the dots.
@@ -59,7 +77,8 @@ def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
     :param curves: of one environment
     """
     for curve in curves:
-        (line,) = axes.plot(curve.timesteps, curve.returns.mean(axis=1), label=curve.label)
+        marker = "o" if len(curve.timesteps) == 1 else None  # a line needs two points
+        (line,) = axes.plot(curve.timesteps, curve.returns.mean(axis=1), label=curve.label, marker=marker)
         steps = np.repeat(curve.timesteps, curve.returns.shape[1])
         axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
     numbers = sorted({curve.returns.shape[1] for curve in curves})
@@ -81,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--until", type=int, metavar="STEP", help="leave out evaluations after this step")
     args = parser.parse_args(argv)
     try:
-        curves = [load_curve(RunFolder.open(run), args.until) for run in args.runs]
+        curves = load_curves(args.runs, args.until)
         if len({curve.env_id for curve in curves}) > 1:
             raise ValueError("The runs must be of one environment; draw one figure for each")
         figure = import_figure()(figsize=(7, 4), layout="constrained")

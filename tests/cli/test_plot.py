@@ -1,5 +1,7 @@
 """Learning curves from the evaluations of runs."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,24 @@ def test_a_curve_can_be_cut(tmp_path):
     assert plot.load_curve(run, until=20).returns.tolist() == [[1, 3], [5, 9]]
     with pytest.raises(ValueError, match="no evaluation until step 9, the first is at step 10"):
         plot.load_curve(run, until=9)
+
+
+def test_runs_of_one_algorithm_and_seed_are_told_apart_by_their_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("low", "high"):
+        make_run(Path(name))
+    runs = [Path("low/tdc/A-v0_1"), tmp_path / "high" / "tdc" / "A-v0_1", make_run(Path("low"), seed=2)]
+    labels = [curve.label for curve in plot.load_curves(runs)]
+    assert labels == ["tdc, seed 1 (low/tdc/A-v0_1)", "tdc, seed 1 (high/tdc/A-v0_1)", "tdc, seed 2"]
+    labels = [curve.label for curve in plot.load_curves([runs[0], make_run(Path("low"))])]
+    assert labels == ["tdc, seed 1 (A-v0_1)", "tdc, seed 1 (A-v0_3)"]
+
+
+def test_a_single_evaluation_can_be_seen():
+    axes = figure.Figure().subplots()
+    for n in (1, 2):
+        plot.draw_curves(axes, [plot.Evaluated(f"tdc, seed {n}", "A-v0", np.arange(n), np.ones((n, 5)))])
+    assert [line.get_marker() for line in axes.lines] == ["o", "None"]
 
 
 def test_a_figure_of_several_runs(tmp_path, capsys):
