@@ -22,6 +22,7 @@ from sb3_tdc.common.threads import set_threads
 from sb3_tdc.common.words import count
 from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
+from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.registry import import_packages, is_of_mujoco, split_env_id
 from sb3_tdc.envs.rendering import (
     VIDEO_SUFFIXES,
@@ -364,7 +365,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Watch, record or explain a trained agent.
 
     :param argv: arguments, those of the process by default
-    :return: 0
+    :return: 0, or 1 if the environment failed
     """
     know_ablations()
     parser = make_parser()
@@ -373,3 +374,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _play_or_explain(args, given)
     except (ValueError, ImportError, DependencyNotInstalled) as error:
         parser.fail(error)
+    except EnvironmentFaultError as error:
+        print(f"{parser.prog}: error: the environment failed: {error}", file=sys.stderr)
+        return 1

@@ -2,7 +2,9 @@
 
 import shutil
 
+import gymnasium as gym
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from sb3_tdc.cli import enjoy
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
@@ -80,3 +82,23 @@ def test_the_critics_of_advb_tdc_are_explained_too(tmp_path, capsys):
     assert "leave out --board" in refused(capsys, run, "--explain", "--board")
     assert enjoy.main([str(run), "--explain", "--n-episodes", "1"]) == 0
     assert (run / "Pendulum-v1_critics.png").stat().st_size > 10_000
+
+
+class Overheats(PendulumEnv):
+    """Fails at its second step."""
+
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 2:
+            raise RuntimeError("the motor is too hot")
+        return super().step(action)
+
+
+def test_an_environment_that_fails_is_named_in_one_sentence(lone, capsys):
+    gym.register("Overheats-v0", Overheats)
+    assert run_enjoy(lone, "--env", "Overheats-v0") == 1
+    error = capsys.readouterr().err
+    assert "error: the environment failed: step() raised RuntimeError: the motor is too hot (" in error
+    assert len(error.splitlines()) == 1
