@@ -169,8 +169,9 @@ class RunFolder:
         """
         if self._finished.is_file():
             return True
-        # RL Zoo does not say: its run is finished if the model has all steps
-        return self._is_of_rl_zoo and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
+        # RL Zoo does not say: its run is finished if the model has all steps, unless it has been started over since
+        may_be_finished = self._is_of_rl_zoo and not self.resume_folder.exists()
+        return may_be_finished and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
 
     def steps_of_model(self) -> int:
         """
@@ -191,6 +192,10 @@ class RunFolder:
     def mark_finished(self, n_timesteps: int) -> None:
         """The last step has been done, and the model saved."""
         _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
+
+    def mark_unfinished(self) -> None:
+        """The run begins again."""
+        self._finished.unlink(missing_ok=True)
 
     def checkpoints(self) -> dict[int, Path]:
         """Return the models of ``--save-freq``, by timestep, oldest first."""

@@ -104,14 +104,14 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     Open a run to resume it.
 
     :param given: the settings on the command line
-    :return: None if the run is finished
+    :return: None if the run is finished, and not to start over
     :raises ValueError: if there is nothing to resume, or a setting contradicts the run's
     """
     folder = RunFolder.open(given["resume"])
     if not (folder.path / folder.env_name / "args.yml").is_file():
         raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
     settings = _resumed_settings(folder, {**given, **_absolute(given)})
-    if folder.is_finished:
+    if folder.is_finished and not settings.start_over:
         return None
     if not settings.writes_states:
         raise ValueError(f"{folder.path} has no resume states: it was made without --resume-freq")

@@ -240,6 +240,7 @@ def _open_states(run: TrainingRun) -> ResumeStates | None:
     )
     if settings.start_over:
         states.store.clear()
+        folder.mark_unfinished()
     if run.is_resumed and not states.store.steps():  # stopped before its first step
         for events in folder.path.glob("events.out.tfevents.*"):
             events.unlink()

@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sb3_tdc import TDC
 from sb3_tdc.resume import LockedError, Restorable, ResumeStates, callback, stored_steps
 from sb3_tdc.resume import run_state as state
+from sb3_tdc.runs import training
 from sb3_tdc.runs.callbacks import busy_machine
 from sb3_tdc.runs.callbacks import stopping as interruption
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
@@ -87,6 +88,18 @@ def test_a_finished_run_is_left_alone(tmp_path, capsys):
     assert resume(folder) == 0
     assert capsys.readouterr().out == f"{folder} is finished: there is nothing to resume\n"
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def test_a_finished_run_starts_over(tmp_path, monkeypatch):
+    assert run_train(tmp_path, n=150) == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    first, mark, before = outcome(folder), folder / "Hopper-v4" / "finished.yml", []
+    save = training._save
+    monkeypatch.setattr(training, "_save", lambda *args: before.append(mark.exists()) or save(*args))
+    assert resume(folder, "--start-over") == 0
+    assert before == [False]  # killed until then, it would be unfinished
+    assert mark.exists()
+    assert outcome(folder) == first
 
 
 def test_starting_over_needs_consent(stopped, whole, capsys):

@@ -3,6 +3,7 @@
 import pytest
 
 from sb3_tdc.runs.folder import RunFolder
+from tests.helpers.run_folders import make_run
 
 
 @pytest.mark.parametrize(
@@ -27,3 +28,11 @@ def test_a_folder_that_another_run_uses_by_now_stays(tmp_path):
     assert [path.name for path in (tmp_path / "logs" / "tdc").iterdir()] == ["Hopper-v4_2"]
     second.remove()  # the folder of all runs was not made for it
     assert (tmp_path / "logs" / "tdc").is_dir()
+
+
+def test_a_run_of_rl_zoo_that_starts_over_is_not_finished(tmp_path):
+    """Its old model has all steps, until the new one takes its place."""
+    run = make_run(tmp_path, steps=1000, n_timesteps=1000)  # without resume_freq in its arguments, as RL Zoo's
+    assert run.is_finished
+    (run.resume_folder / "replay").mkdir(parents=True)
+    assert not run.is_finished
