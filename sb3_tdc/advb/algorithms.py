@@ -9,7 +9,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_tdc.advb import policies
-from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within
+from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_observation_space, check_within
 from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, integer
 from sb3_tdc.tdc import TDC
@@ -36,6 +36,7 @@ class Advised(NoisyOffPolicyAlgorithm):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
+        check_observation_space(self.observation_space)
         self.formation_period = int(check_within(self.limits, "formation_period", self.formation_period))
         check_within(self.limits, "n_members", self.policy_kwargs.get("n_members", 10), "policy_kwargs['n_members']")
         super()._setup_model()

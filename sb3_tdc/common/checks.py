@@ -138,6 +138,19 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
 
 
+def check_observation_space(space: spaces.Space) -> None:
+    """
+    Check that SB3's networks can take the observations of a space: they flatten all axes but the first, the batch's.
+
+    :raises ValueError: if a ``Box``, or one within a ``Dict``, has no axis
+    """
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    for name, part in parts.items():
+        if isinstance(part, spaces.Box) and part.shape == ():
+            got = f"{part} in {name!r}" if name else part
+            raise ValueError(f"env must have observations of at least one axis, got {got}: give it the shape (1,)")
+
+
 def check_device(name: str, device: str, remedy: str = "") -> None:
     """
     Check that a device is there, if it is a CPU or a GPU; SB3 would compute on the CPU where there is no GPU.

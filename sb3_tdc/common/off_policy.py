@@ -17,6 +17,7 @@ from sb3_tdc.common.checks import (
     Limits,
     check_boolean,
     check_number,
+    check_observation_space,
     check_within,
     find_non_finite,
 )
@@ -50,6 +51,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     # ---------------------------------------------------------------- arguments
 
     def _check_arguments(self) -> None:
+        check_observation_space(self.observation_space)
         self._check_limits("tau", "gamma", "buffer_size", "batch_size", "n_steps", "learning_starts", "gradient_steps")
         self.optimize_memory_usage = bool(check_boolean("optimize_memory_usage", self.optimize_memory_usage))
         for name in self.schedules:

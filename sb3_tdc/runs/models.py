@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.checks import check_observation_space
 from sb3_tdc.common.files import write_atomically
 from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
 from sb3_tdc.common.words import count
@@ -31,9 +32,10 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
 
     :param algo: a key of ``ALGORITHMS``
     :param kwargs: further arguments of the algorithm's constructor
-    :raises ValueError: if the policy is for other observations, or the memory is too small
+    :raises ValueError: if the policy or the networks are for other observations, or the memory is too small
     """
     space = env.observation_space
+    check_observation_space(space)
     if hyperparams.model["policy"] == "MultiInputPolicy" and not isinstance(space, spaces.Dict):
         raise ValueError(
             f"policy MultiInputPolicy is for Dict observations, got {space}: use policy:MlpPolicy or policy:CnnPolicy"
