@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
+from gymnasium.wrappers import NormalizeObservation
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
@@ -58,6 +59,8 @@ _OPTIONS: dict[str, tuple[type, tuple[str, ...]]] = {
 }
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 _OF_NOISE = ("noise_type", "noise_std")
+# Wrappers with statistics that the policy depends on, and that nobody would save with it
+_NORMALIZING = (VecNormalize, NormalizeObservation)
 
 
 @dataclass
@@ -388,6 +391,8 @@ def _factories(entries: Any, where: str) -> list[Callable]:
         except (TypeError, ValueError) as error:
             detail = f": {error}" if str(error) else ""
             raise ValueError(f"{where} must name a class, or map it to its keyword arguments{detail}") from error
+        if issubclass(cls, _NORMALIZING):
+            raise ValueError(f"{where}: the statistics of {cls.__name__} are not saved with a model; use normalize")
         factories.append(lambda *args, cls=cls, kwargs=kwargs or {}: cls(*args, **kwargs))
     return factories
 

@@ -199,6 +199,11 @@ def test_values_become_what_the_constructor_wants():
         ),
         ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": [0]}}}, "net_arch must be an integer of at least 1, got 0"),
         ({"env_wrapper": "print"}, "env_wrapper must name a class"),
+        (
+            {"vec_env_wrapper": [{"stable_baselines3.common.vec_env.VecNormalize": {"gamma": 0.9}}]},
+            "vec_env_wrapper: the statistics of VecNormalize are not saved with a model; use normalize",
+        ),
+        ({"env_wrapper": "gymnasium.wrappers.NormalizeObservation"}, "NormalizeObservation are not saved with a model"),
         ({"callback": {"a.B": {}, "c.D": {}}}, "callback must name a class, or map it to its keyword arguments"),
     ],
     ids=lambda value: str(value)[:40],
