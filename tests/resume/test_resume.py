@@ -5,6 +5,7 @@ import functools
 import hashlib
 import json
 import os
+import pickle
 import random
 import re
 import shutil
@@ -100,6 +101,16 @@ def test_a_finished_run_starts_over(tmp_path, monkeypatch):
     assert before == [False]  # killed until then, it would be unfinished
     assert mark.exists()
     assert outcome(folder) == first
+
+
+def test_a_registered_function_need_not_be_sent_from_its_process(tmp_path, recwarn):
+    gym.register("OfAFunction-v0", lambda **kwargs: PendulumEnv(**kwargs), max_episode_steps=50)
+    spec = pickle.loads(pickle.dumps(Restorable(gym.make("OfAFunction-v0", max_episode_steps=20)).spec))
+    assert (spec.id, spec.max_episode_steps) == ("OfAFunction-v0", 20)
+    assert run_train(tmp_path, "--vec-env", "subproc", "-params", *SMALL[1:], "n_envs:2", env="OfAFunction-v0") == 0
+    with np.load(tmp_path / "tdc" / "OfAFunction-v0_1" / "evaluations.npz") as evaluations:
+        assert (evaluations["ep_lengths"] == 50).all()
+    assert not [warned for warned in recwarn if "OfAFunction" in str(warned.message) or "spec" in str(warned.message)]
 
 
 def test_starting_over_needs_consent(stopped, whole, capsys):
