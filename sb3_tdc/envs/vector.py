@@ -130,14 +130,29 @@ class GymnasiumVecEnv(VecEnv):
             values = [getattr(self.env, attr_name)] * self.num_envs
         return [values[i] for i in chosen]
 
+    @property
+    def has_single_envs(self) -> bool:
+        """Whether a method of one environment can be called, and not only that of all."""
+        return self._envs is not None or (self.num_envs == 1 and hasattr(self.env, "call"))
+
+    @property
+    def _envs(self) -> Sequence[gym.Env] | None:
+        return getattr(self.env, "envs", None)
+
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        self._require_all("set_attr", indices)
+        chosen = self._choose("set_attr", indices)
+        if chosen is not None:
+            for env in chosen:
+                env.set_wrapper_attr(attr_name, value)
+            return
         if not hasattr(self.env, "set_attr"):
             raise AttributeError(f"{self.env} cannot set attributes of its environments ({attr_name})")
         self.env.set_attr(attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        self._require_all("env_method", indices)
+        chosen = self._choose("env_method", indices)
+        if chosen is not None:
+            return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in chosen]
         if not hasattr(self.env, "call"):
             raise AttributeError(f"{self.env} cannot call methods of its environments ({method_name})")
         return list(self.env.call(method_name, *method_args, **method_kwargs))
@@ -145,13 +160,18 @@ class GymnasiumVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         from stable_baselines3.common.env_util import is_wrapped
 
-        envs = getattr(self.env, "envs", None)
+        envs = self._envs
         chosen = self._get_indices(indices)
         return [envs is not None and is_wrapped(envs[i], wrapper_class) for i in chosen]
 
-    def _require_all(self, what: str, indices: Any) -> None:
-        if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
-            raise ValueError(f"{what} of Gymnasium's vector environments is for all environments at once")
+    def _choose(self, what: str, indices: Any) -> list[gym.Env] | None:
+        """Return the chosen environments, or None for all of a vector environment that holds no single ones."""
+        chosen = list(self._get_indices(indices))
+        if self._envs is not None:
+            return [self._envs[i] for i in chosen]
+        if sorted(chosen) != list(range(self.num_envs)):
+            raise ValueError(f"{what} of {self.env} is for all environments at once")
+        return None
 
 
 def to_numpy(value: Any) -> Any:

@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.checks import check_observation_space
 from sb3_tdc.common.files import write_atomically
 from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
 from sb3_tdc.common.words import count
+from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.runs.callbacks.finite_guard import check_weights
 from sb3_tdc.runs.folder import RunFolder
@@ -32,7 +35,7 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
 
     :param algo: a key of ``ALGORITHMS``
     :param kwargs: further arguments of the algorithm's constructor
-    :raises ValueError: if the policy or the networks are for other observations, or the memory is too small
+    :raises ValueError: if the policy, the networks or the replay buffer are for others, or the memory is too small
     """
     space = env.observation_space
     check_observation_space(space)
@@ -40,8 +43,18 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
         raise ValueError(
             f"policy MultiInputPolicy is for Dict observations, got {space}: use policy:MlpPolicy or policy:CnnPolicy"
         )
+    _check_hindsight(hyperparams, env)
     with _enough_memory(hyperparams):
         return ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
+
+
+def _check_hindsight(hyperparams: Hyperparams, env: VecEnv) -> None:
+    kind, vector = hyperparams.model.get("replay_buffer_class") or ReplayBuffer, env.unwrapped
+    if issubclass(kind, HerReplayBuffer) and isinstance(vector, GymnasiumVecEnv) and not vector.has_single_envs:
+        raise ValueError(
+            f"{kind.__name__} calls compute_reward of single environments, and {vector.env} has none: "
+            "use --vec-env dummy or subproc, or another replay_buffer_class"
+        )
 
 
 @contextmanager
@@ -62,8 +75,9 @@ def continue_model(
     Load a model to train it further: its policy stays as it was saved, all else is as its hyperparameters say.
 
     :param path: a zip
-    :raises ValueError: as :func:`load_model`
+    :raises ValueError: as :func:`load_model`, or if the replay buffer is for other environments
     """
+    _check_hindsight(hyperparams, env)
     of_the_saved_model = ("policy", "policy_kwargs")
     arguments = {name: value for name, value in hyperparams.model.items() if name not in of_the_saved_model}
     with _enough_memory(hyperparams):

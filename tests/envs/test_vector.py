@@ -15,6 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from sb3_tdc import TDC, ResumeStates
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs.vector import GymnasiumVecEnv, split_infos
+from sb3_tdc.hyperparams import parse
+from sb3_tdc.runs.models import make_model
 
 MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED]
 
@@ -188,6 +190,53 @@ class Together(VectorEnv):
         return self._observe(), np.full(self.num_envs, float(self.t)), false, over, {}
 
 
+class Reach(gym.Env):
+    """The goal is 1; the action moves towards it or away."""
+
+    observation_space = gym.spaces.Dict(
+        dict.fromkeys(("observation", "achieved_goal", "desired_goal"), gym.spaces.Box(-9, 9, (1,), np.float32))
+    )
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    n_calls = 0
+
+    def _observe(self):
+        return {"observation": self.x, "achieved_goal": self.x, "desired_goal": np.float32([1])}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.float32([0])
+        return self._observe(), {}
+
+    def step(self, action):
+        self.x = np.clip(self.x + action, -9, 9).astype(np.float32)
+        return self._observe(), float(self.compute_reward(self.x, 1.0, {})), False, False, {}
+
+    def compute_reward(self, achieved, desired, info):
+        Reach.n_calls += np.ndim(achieved) == 2  # a batch of the replay buffer
+        return -np.abs(achieved - desired).sum(axis=-1)
+
+
+HINDSIGHT = ["policy:MultiInputPolicy", "replay_buffer_class:stable_baselines3.HerReplayBuffer", "n_envs:2"]
+
+
+def test_hindsight_asks_one_of_the_environments(tmp_path):
+    gym.register("Reach-v0", Reach, max_episode_steps=10)
+    argv = ["--env", "Reach-v0", "-n", "60", "--vec-env", "gymnasium", "--eval-freq", "0", "-f", str(tmp_path)]
+    networks = ["policy_kwargs:{net_arch: [8]}", "learning_starts:40", "batch_size:8", "buffer_size:200"]
+    Reach.n_calls = 0
+    assert train.main([*argv, "--device", "cpu", "-params", *HINDSIGHT, *networks]) == 0
+    assert Reach.n_calls == 10  # steps of both after the first 40: one update each, with one call of one environment
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_hindsight_without_single_environments_is_refused_before_the_first_step(n_envs):
+    vector = Tensors(n_envs)
+    vector.single_observation_space = Reach.observation_space
+    hyperparams = parse({"n_timesteps": 10, **dict(line.split(":") for line in HINDSIGHT[:2])}, TDC, "a file")
+    with pytest.raises(ValueError, match=r"HerReplayBuffer calls compute_reward of single .*, and Tensors.* has none"):
+        make_model("tdc", hyperparams, VecMonitor(GymnasiumVecEnv(vector)))
+
+
 def test_environments_that_take_one_seed_and_reset_together():
     env = GymnasiumVecEnv(Together())
     env.seed(7)
@@ -238,10 +287,14 @@ def test_attributes_and_methods():
     assert env.get_attr("episode") == [7, 7]
     assert [step["step"].tolist() for step in env.env_method("_observe")] == [[0], [0]]
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
-    for call in (lambda: env.set_attr("episode", 1, indices=0), lambda: env.env_method("_observe", indices=[1])):
-        with pytest.raises(ValueError, match="for all environments at once"):
-            call()
+    env.set_attr("episode", [8, 9], indices=0)  # a list is a value like others
+    assert env.get_attr("episode") == [[8, 9], 7]
+    env.set_attr("episode", 5, indices=0)
+    assert [step["episode"].tolist() for step in env.env_method("_observe", indices=[1, 0])] == [[7], [5]]
     tensors = GymnasiumVecEnv(Tensors())
+    for call in (lambda: tensors.set_attr("t", 1, indices=0), lambda: tensors.env_method("_observe", indices=[1])):
+        with pytest.raises(ValueError, match=r"of Tensors.* is for all environments at once"):
+            call()
     with pytest.raises(AttributeError, match="cannot set attributes"):
         tensors.set_attr("gravity", 1)
     with pytest.raises(AttributeError, match="cannot call methods"):
