@@ -90,6 +90,18 @@ class RunFolder:
             raise ValueError(f"{path} is not the folder of a run: it has no <environment>/config.yml")
         return cls(path, configs[0].parent.name)
 
+    @classmethod
+    def around(cls, model: Path, env_id: str) -> "RunFolder":
+        """
+        Return the folder that a model lies in, with what lies there for it.
+
+        :param env_id: names what lies next to a model that is not in the folder of a run
+        """
+        try:
+            return cls.open(model.parent)
+        except ValueError:
+            return cls(model.parent, folder_name(env_id))
+
     @property
     def model(self) -> Path:
         return self.path / f"{self.env_name}.zip"
@@ -212,6 +224,11 @@ class RunFolder:
         if match := _CHECKPOINT.fullmatch(model.name):
             return self.path / f"rl_model_vecnormalize_{match[1]}_steps.pkl"
         return self.path / self.env_name / "vecnormalize.pkl"
+
+    def find_normalization(self, model: Path) -> Path | None:
+        """Return the ``VecNormalize`` statistics of one of the run's models, or those of the run, if there are any."""
+        # RL Zoo keeps one for all its models
+        return next((path for path in map(self.normalization, (model, self.model)) if path.is_file()), None)
 
     def replay_buffer(self, model: Path) -> Path:
         """Return where the replay buffer of one of the run's models is."""

@@ -118,11 +118,12 @@ def _find_normalization(run: RunFolder, path: Path) -> Path:
 
     :raises ValueError: if the statistics that a model needs are missing
     """
-    of_the_model, of_the_run = run.normalization(path), run.normalization(run.model)
-    for found in (of_the_model, of_the_run):  # RL Zoo keeps one for all its models
-        if found.is_file():
-            return found
-    raise ValueError(f"{of_the_run} is missing: {path.name} was trained on normalised observations")
+    found = run.find_normalization(path)
+    if found is None:
+        raise ValueError(
+            f"{run.normalization(run.model)} is missing: {path.name} was trained on normalised observations"
+        )
+    return found
 
 
 def open_zip(path: Path, algo: str, env_id: str, trust: bool = False) -> TrainedModel:

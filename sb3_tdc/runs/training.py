@@ -263,10 +263,8 @@ def _select_state(run: TrainingRun, states: ResumeStates, model: OffPolicyAlgori
 def _make_training_envs(run: TrainingRun) -> VecEnv:
     normalization = None
     if run.origin is not None and not run.has_state:
-        normalization = RunFolder(run.origin.parent, run.folder.env_name).normalization(run.origin)
-        if not normalization.exists():
-            normalization = None
-        elif run.hyperparams.normalize is None:
+        normalization = RunFolder.around(run.origin, run.settings.env).find_normalization(run.origin)
+        if normalization is not None and run.hyperparams.normalize is None:
             raise ValueError(f"{run.origin} was trained on normalised observations: add -params normalize:true")
     settings = run.settings
     return make_envs(
@@ -302,7 +300,7 @@ def _make_model(run: TrainingRun, env: VecEnv) -> OffPolicyAlgorithm:
     if run.origin is None:
         return make_model(settings.algo, run.hyperparams, env, **arguments)
     model = continue_model(run.origin, settings.algo, run.hyperparams, env, settings.trust, **arguments)
-    experience = RunFolder(run.origin.parent, run.folder.env_name).replay_buffer(run.origin)
+    experience = RunFolder.around(run.origin, settings.env).replay_buffer(run.origin)
     if not run.has_state and experience.exists():
         load_experience(model, experience, settings.trust)
     return model

@@ -10,10 +10,12 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 import yaml
+from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_tdc import TDC
@@ -22,6 +24,7 @@ from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.runs.callbacks.stopping import StopOnSignal
 from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.safe_load import load_normalization
 from tests.helpers.command_line import ROOT, SMALL, SMALL_ANY, run_enjoy, run_train
 
 
@@ -159,6 +162,20 @@ def test_going_on_from_a_saved_model(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
+def test_normalisation_goes_on_in_an_environment_of_another_id(tmp_path, capsys):
+    gym.register("Other-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=100)
+    normalized = [*SMALL, "normalize:true"]
+    assert run_train(tmp_path, env="Pendulum-v1", n=120, small=normalized) == 0
+    first = tmp_path / "tdc" / "Pendulum-v1_1" / "Pendulum-v1.zip"
+    with pytest.raises(SystemExit):
+        run_train(tmp_path, "-i", first, env="Other-v0", n=130)
+    assert f"{first} was trained on normalised observations: add -params normalize:true" in capsys.readouterr().err
+    assert run_train(tmp_path, "-i", first, env="Other-v0", n=130, small=normalized) == 0
+    env = DummyVecEnv([lambda: gym.make("Other-v0")])
+    saved = load_normalization(tmp_path / "tdc" / "Other-v0_1" / "Other-v0" / "vecnormalize.pkl", env)
+    assert round(saved.obs_rms.count) == (1 + 120) + (1 + 130)  # the first observation, and one each step
+
+
 def test_the_command_to_go_on_is_the_same_experiment(tmp_path, capsys, monkeypatch):
     def stop_at_150(self):
         self.requested = self.n_calls == 150
@@ -247,8 +264,6 @@ def test_returns_are_those_of_the_mean_action(tmp_path, capsys):
     capsys.readouterr()
     run_enjoy("--env", "Hopper-v4", "-f", tmp_path, "--seed", 5)
     shown = capsys.readouterr().out
-    import gymnasium as gym
-
     model = TDC.load(tmp_path / "tdc" / "Hopper-v4_1" / "Hopper-v4.zip")
     env, done, total = gym.make("Hopper-v4"), False, 0.0
     observation, _ = env.reset(seed=5)
