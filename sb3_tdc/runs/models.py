@@ -23,7 +23,8 @@ from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.runs.callbacks.finite_guard import check_weights
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.safe_load import load_replay_buffer, load_safely, read_data
+from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, read_data
+from sb3_tdc.safe_load.fields import on_the_command_line
 
 # A full disk; PyTorch reports it in its own way
 DISK_ERRORS = (OSError, RuntimeError)
@@ -114,7 +115,10 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
     check_saved_by(path, algo)
     if trust:
         return ALGORITHMS[algo].load(path, env=env, **kwargs)
-    return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
+    try:
+        return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
+    except UnsafeFileError as error:
+        raise UnsafeFileError(on_the_command_line(str(error))) from error
 
 
 def check_saved_by(path: Path, algo: str) -> None:

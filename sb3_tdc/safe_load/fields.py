@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import re
 import warnings
 from contextlib import suppress
 from typing import Any
@@ -107,6 +108,14 @@ def read_fields(
         if field.is_required and name not in {**fields, **custom_objects}:
             raise UnsafeFileError(f"the field {name} is missing (custom_objects can give it)")
     return fields, algorithm
+
+
+_REMEDY = re.compile(r"\(custom_objects can \w+ it\)")
+
+
+def on_the_command_line(sentence: str) -> str:
+    """Return why a file is refused as a command says it: there, ``custom_objects`` is no flag."""
+    return _REMEDY.sub("(if you know its origin, enjoy and train open it with --trust)", sentence)
 
 
 def _read_field(name: str, value: Any, declared: SavedField, make: Rebuild) -> Any:

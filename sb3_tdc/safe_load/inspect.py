@@ -17,10 +17,10 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
-from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES, foreign_names, parse_data, read_fields
+from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES, foreign_names, on_the_command_line, parse_data
 from sb3_tdc.safe_load.inert_pickle import Call, names_in, read_pickle
 from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, pickled_name
-from sb3_tdc.safe_load.models import load_safely
+from sb3_tdc.safe_load.models import load_safely, read_model_fields
 from sb3_tdc.safe_load.reading import reading
 from sb3_tdc.safe_load.regular_files import open_regular
 
@@ -49,11 +49,11 @@ def inspect(path: Path, algorithm: type[OffPolicyAlgorithm] | None = None) -> tu
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            model = load_safely(
-                path, _stand_in(path, size, algorithm), device="cpu", algorithm=algorithm, buffer_size=1
-            )
+            env = _stand_in(path, algorithm)
+            model = load_safely(path, env, device="cpu", algorithm=algorithm, buffer_size=1)
     except ValueError as error:
-        return [*lines, f"Refused: {escaped(str(error).removeprefix(f'{path} was not opened: '))}"], False
+        reason = on_the_command_line(str(error).removeprefix(f"{path} was not opened: "))
+        return [*lines, f"Refused: {escaped(reason)}"], False
     return [*lines, f"Would be opened as a {type(model).__name__} of {model.num_timesteps:,} steps."], True
 
 
@@ -64,19 +64,13 @@ class _StandIn(gym.Env):
         self.observation_space, self.action_space = fields["observation_space"], fields["action_space"]
 
 
-def _stand_in(path: Path, size: int, algorithm: type[OffPolicyAlgorithm] | None) -> VecEnv | None:
+def _stand_in(path: Path, algorithm: type[OffPolicyAlgorithm] | None) -> VecEnv | None:
     """
     Return what a model with a hindsight buffer needs of its environment to be opened; None for all others.
 
     :raises ValueError: if the model is refused
     """
-    with reading(f"{path} was not opened"):
-        budget = Budget(size)
-        with open_regular(path, MAX_BYTES) as (file, _):
-            entries = read_archive(file, MODEL_ENTRIES, budget)
-        if "data" not in entries:
-            return None
-        fields, _ = read_fields(entries["data"], {}, budget, algorithm)
+    fields = read_model_fields(path, algorithm)
     is_of_hindsight = fields.get("replay_buffer_class") is HerReplayBuffer
     return DummyVecEnv([lambda: _StandIn(fields)]) if is_of_hindsight and "action_space" in fields else None
 

@@ -54,12 +54,7 @@ def load_safely(
     if not path.exists() and path.with_name(f"{path.name}.zip").is_file():
         path = path.with_name(f"{path.name}.zip")
     with reading(f"{path} was not opened"):
-        with open_regular(path, MAX_BYTES) as (file, size):
-            budget = Budget(size)
-            entries = read_archive(file, MODEL_ENTRIES, budget)
-        for required in ("data", "policy.pth"):
-            if required not in entries:
-                raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
+        entries, budget = _read_entries(path)
         given = {**kwargs, **(custom_objects or {})}
         of_the_caller = {name: value for name, value in given.items() if name != "ent_coef"}
         fields, algorithm = read_fields(entries["data"], of_the_caller, budget, algorithm)
@@ -85,6 +80,29 @@ def load_safely(
         check_replay_memory(fields)
         check_weights(policy_class, fields, tensors["policy"])
         return _make_model(algorithm, policy_class, env, device, fields, tensors, new_temperature)
+
+
+def read_model_fields(path: Path, algorithm: type[OffPolicyAlgorithm] | None = None) -> dict[str, Any]:
+    """
+    Read and check the fields of a saved model as :func:`load_safely` does; the weights are not looked at.
+
+    :raises UnsafeFileError: as :func:`load_safely`
+    """
+    with reading(f"{path} was not opened"):
+        entries, budget = _read_entries(path)
+        fields, _ = read_fields(entries["data"], {}, budget, algorithm)
+        return fields
+
+
+def _read_entries(path: Path) -> tuple[dict[str, bytes], Budget]:
+    """Return the entries of a saved model, and the budget for what is read from them."""
+    with open_regular(path, MAX_BYTES) as (file, size):
+        budget = Budget(size)
+        entries = read_archive(file, MODEL_ENTRIES, budget)
+    for required in ("data", "policy.pth"):
+        if required not in entries:
+            raise UnsafeFileError(f"it is not the zip of a saved model, it has no {required}")
+    return entries, budget
 
 
 def read_data(path: str | Path) -> dict[str, Any]:

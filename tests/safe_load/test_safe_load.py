@@ -636,7 +636,11 @@ def test_enjoy_runs_nothing_unless_it_is_trusted(run, marker, capsys):
     model, normalization = run / "Hopper-v4.zip", run / "Hopper-v4" / "vecnormalize.pkl"
     poisoned = with_fields(model, run / "poisoned", gamma=serialized(Poison())).read_bytes()
     for path, content, message in (
-        (model, poisoned, "the field gamma (custom_objects can replace it): a call of builtins.exec"),
+        (
+            model,
+            poisoned,
+            "the field gamma (if you know its origin, enjoy and train open it with --trust): a call of builtins.exec",
+        ),
         (normalization, pickle.dumps(Poison()), "it does not hold a VecNormalize"),
     ):
         good = path.read_bytes()
