@@ -1,6 +1,7 @@
 """``sb3-tdc enjoy logs/tdc/Walker2d-v4_1``: watch, record or explain a trained agent."""
 
 import argparse
+import sys
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path

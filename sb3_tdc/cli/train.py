@@ -1,11 +1,9 @@
 """``sb3-tdc train --algo tdc --env Walker2d-v4``: arguments and messages; the run itself is in ``runs/training.py``."""
 
-import shlex
 import sys
 import time
 from collections.abc import Sequence
 from datetime import timedelta
-from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser, add_settings
 from sb3_tdc.common.commands import command
@@ -14,9 +12,11 @@ from sb3_tdc.common.output import harmless_output, warnings_as_sentences
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.resume import LockedError, NotRestoredError, stored_steps
 from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.models import needs_trust
 from sb3_tdc.runs.settings import RunSettings
 from sb3_tdc.runs.setup import make_run, resume_run
 from sb3_tdc.runs.training import NotSavedError, SetupError, TrainingError, TrainingOutcome, TrainingRun, train
+from sb3_tdc.safe_load.run_files import refused_imports
 
 _TUNE = "to search hyperparameters: sb3-tdc tune (--search, --samples, --seeds, --jobs)"
 _TRACK = "a run writes TensorBoard files into its folder; `wandb sync` uploads them"
@@ -98,8 +98,7 @@ def _main(argv: Sequence[str] | None) -> int:
         _print_how_to_continue(argv, run, outcome)
         return 130
     if settings.verbose > 0:
-        packages = ["--gym-packages", *settings.gym_packages] if settings.gym_packages else []
-        print(f"To watch it: {command('enjoy', folder.path, *packages)}")
+        print(f"To watch it: {_command_to_watch(run)}")
     return 0
 
 
@@ -135,13 +134,24 @@ def _print_how_to_continue(argv: Sequence[str] | None, run: TrainingRun, outcome
         with_buffer = run.settings.save_replay_buffer
         experience = "with" if with_buffer else "without (--save-replay-buffer keeps it)"
         print(f"Stopped at step {steps:,} of {total:,}. To continue in a new run, {experience} the replay buffer:")
-        print(f"  {_command_to_continue(argv, total - steps, folder.model)}")
+        print(f"  {_command_to_continue(argv, run, total - steps)}")
 
 
-def _command_to_continue(argv: Sequence[str] | None, n_timesteps: int, model: Path) -> str:
+def _command_to_watch(run: TrainingRun) -> str:
+    """Return the command that plays the model, with the consent to the user's own code that it requires."""
+    modules = dict.fromkeys(module for module, _ in refused_imports(run.settings.as_plain(), run.hyperparams.raw))
+    packages = ["--gym-packages", *modules] if modules else []
+    return command("enjoy", run.folder.path, *packages, *_trust(run))
+
+
+def _trust(run: TrainingRun) -> list[str]:
+    return ["--trust"] if needs_trust(run.folder.model, run.settings.algo) else []
+
+
+def _command_to_continue(argv: Sequence[str] | None, run: TrainingRun, n_timesteps: int) -> str:
     """Return this command with another number of steps, and a model to start from."""
     without = Parser("")
     without.add_argument("-n", "--n-timesteps")
     without.add_argument("-i", "--trained-agent")
     _, others = without.parse_known_args(sys.argv[1:] if argv is None else argv)
-    return f"{command('train')} {shlex.join(['-n', str(n_timesteps), '-i', str(model), *others])}"
+    return command("train", "-n", n_timesteps, "-i", run.folder.model, *_trust(run), *others)

@@ -1,5 +1,6 @@
 """A run's model: built, loaded with what was saved next to it, or saved with the statistics of its environments."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,7 @@ from sb3_tdc.runs.callbacks.finite_guard import check_weights
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, read_data
 from sb3_tdc.safe_load.fields import on_the_command_line
+from sb3_tdc.safe_load.models import read_model_fields
 
 # A full disk; PyTorch reports it in its own way
 DISK_ERRORS = (OSError, RuntimeError)
@@ -119,6 +121,17 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
         return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
     except UnsafeFileError as error:
         raise UnsafeFileError(on_the_command_line(str(error))) from error
+
+
+def needs_trust(path: Path, algo: str) -> bool:
+    """Return whether a saved model names code that :func:`load_model` refuses, a class of the user's for instance."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            read_model_fields(path, ALGORITHMS[algo])
+    except UnsafeFileError:
+        return True
+    return False
 
 
 def check_saved_by(path: Path, algo: str) -> None:

@@ -1,7 +1,7 @@
 """What the YAML files of a downloaded run may ask for: arguments of the right types, and wrappers that only wrap."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from sb3_tdc.common.untrusted import escaped, shown
@@ -78,27 +78,36 @@ def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented:
     :param consented: packages and modules that the user has named
     :raises ValueError: if the files name code to import that is neither known to be harmless nor consented to
     """
+    for _, reason in refused_imports(args, config, consented):
+        raise ValueError(f"{where} asks for {reason}")
+
+
+def refused_imports(
+    args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str] = ()
+) -> Iterator[tuple[str, str]]:
+    """Return the module of all code that :func:`check_imports` refuses, each with what is asked for and the remedy."""
     for name in packages_of(args):
         if name not in consented:
-            raise ValueError(
-                f"{where} asks for the package {escaped(name)}: if you know it, add --gym-packages {escaped(name)}"
-            )
+            yield name, f"the package {escaped(name)}: if you know it, add --gym-packages {escaped(name)}"
+    for key, name, kwargs in _wrappers(config):
+        if any(name.startswith(f"{prefix}.") for prefix in consented):
+            continue
+        module, _, _ = name.rpartition(".")
+        wrapper, remedy = f"{key} {escaped(name)}", "if you know it, add its module to --gym-packages"
+        if not _is_known(name):
+            yield module, f"{wrapper}: {remedy}"
+        for argument in kwargs or {} if isinstance(kwargs, dict | None) else [kwargs]:
+            if not isinstance(argument, str) or _NAMES_A_FILE.search(argument):
+                yield module, f"{wrapper} with {shown(argument)}, which may write a file: {remedy}"
+
+
+def _wrappers(config: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """Return the key, the name and the keyword arguments of each wrapper."""
     for key in ("env_wrapper", "vec_env_wrapper"):
         wrappers = config.get(key) or []
         for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
             for name, kwargs in wrapper.items() if isinstance(wrapper, dict) else [(wrapper, None)]:
-                if any(str(name).startswith(f"{prefix}.") for prefix in consented):
-                    continue
-                if not _is_known(str(name)):
-                    raise ValueError(
-                        f"{where} asks for {key} {escaped(str(name))}: if you know it, add its module to --gym-packages"
-                    )
-                for argument in kwargs or {} if isinstance(kwargs, dict | None) else [kwargs]:
-                    if not isinstance(argument, str) or _NAMES_A_FILE.search(argument):
-                        raise ValueError(
-                            f"{where} asks for {key} {escaped(str(name))} with {shown(argument)}, which may write a "
-                            "file: if you know it, add its module to --gym-packages"
-                        )
+                yield key, str(name), kwargs
 
 
 def _is_known(name: str) -> bool:

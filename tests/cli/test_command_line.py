@@ -176,11 +176,12 @@ def test_normalisation_goes_on_in_an_environment_of_another_id(tmp_path, capsys)
     assert round(saved.obs_rms.count) == (1 + 120) + (1 + 130)  # the first observation, and one each step
 
 
-def test_the_command_to_go_on_is_the_same_experiment(tmp_path, capsys, monkeypatch):
-    def stop_at_150(self):
-        self.requested = self.n_calls == 150
-        return not self.requested
+def stop_at_150(self):
+    self.requested = self.n_calls == 150
+    return not self.requested
 
+
+def test_the_command_to_go_on_is_the_same_experiment(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(StopOnSignal, "_on_step", stop_at_150)
     params = [*SMALL, "lam:0.25", "normalize:true"]
     assert run_train(tmp_path, "--resume-freq", -1, small=params) == 130
@@ -212,6 +213,46 @@ def test_an_environment_named_with_its_package(tmp_path, monkeypatch, capsys):
     assert run_train(tmp_path, env="my_package:Mine-v0") == 0
     (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("To watch it")]
     assert run_enjoy(*shlex.split(command)[5:]) == 0  # names the package: a folder alone imports nothing
+
+
+@pytest.fixture
+def own_parts(tmp_path, monkeypatch):
+    """Hyperparameters that name the user's own classes."""
+    (tmp_path / "own_parts.py").write_text(
+        "import gymnasium as gym\nfrom stable_baselines3.common.torch_layers import FlattenExtractor\n"
+        "class Wrapper(gym.Wrapper): pass\nclass Extractor(FlattenExtractor): pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    sys.modules.pop("own_parts", None)
+    networks = "policy_kwargs:{net_arch: [8], n_quantiles: 5, features_extractor_class: own_parts.Extractor}"
+    return ["-params", networks, *SMALL[2:], "env_wrapper:own_parts.Wrapper"]
+
+
+def test_the_command_to_watch_consents_to_classes_of_the_user_s_own(tmp_path, own_parts, capsys):
+    assert run_train(tmp_path, env="Pendulum-v1", n=120, small=own_parts) == 0
+    command = capsys.readouterr().out.rpartition("To watch it: sb3-tdc enjoy ")[2]
+    folder = tmp_path / "tdc" / "Pendulum-v1_1"
+    assert shlex.split(command) == [str(folder), "--gym-packages", "own_parts", "--trust"]
+    assert run_enjoy(*shlex.split(command)) == 0
+    for trusting_less, refused in (
+        ([folder], "asks for env_wrapper own_parts.Wrapper"),
+        (
+            [folder, "--gym-packages", "own_parts"],
+            "the field policy_kwargs (if you know its origin, enjoy and train open it with --trust): "
+            "a reference to own_parts.Extractor",
+        ),
+    ):
+        with pytest.raises(SystemExit):
+            run_enjoy(*trusting_less)
+        assert refused in capsys.readouterr().err
+
+
+def test_the_command_to_go_on_consents_to_classes_of_the_user_s_own(tmp_path, own_parts, capsys, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(StopOnSignal, "_on_step", stop_at_150)
+        assert run_train(tmp_path, "--resume-freq", -1, env="Pendulum-v1", small=own_parts) == 130
+    (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  sb3-tdc train")]
+    assert train.main(shlex.split(command)[2:]) == 0
 
 
 def test_a_log_of_nothing(tmp_path):
