@@ -115,7 +115,7 @@ _REMEDY = re.compile(r"\(custom_objects can \w+ it\)")
 
 def on_the_command_line(sentence: str) -> str:
     """Return why a file is refused as a command says it: there, ``custom_objects`` is no flag."""
-    return _REMEDY.sub("(if you know its origin, enjoy and train open it with --trust)", sentence)
+    return _REMEDY.sub("(if you know its origin, enjoy, evaluate and train open it with --trust)", sentence)
 
 
 def _read_field(name: str, value: Any, declared: SavedField, make: Rebuild) -> Any:

@@ -238,7 +238,7 @@ def test_the_command_to_watch_consents_to_classes_of_the_user_s_own(tmp_path, ow
         ([folder], "asks for env_wrapper own_parts.Wrapper"),
         (
             [folder, "--gym-packages", "own_parts"],
-            "the field policy_kwargs (if you know its origin, enjoy and train open it with --trust): "
+            "the field policy_kwargs (if you know its origin, enjoy, evaluate and train open it with --trust): "
             "a reference to own_parts.Extractor",
         ),
     ):
