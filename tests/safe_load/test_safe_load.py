@@ -639,7 +639,8 @@ def test_enjoy_runs_nothing_unless_it_is_trusted(run, marker, capsys):
         (
             model,
             poisoned,
-            "the field gamma (if you know its origin, enjoy, evaluate and train open it with --trust): a call of builtins.exec",
+            "the field gamma (if you know its origin, enjoy, evaluate and train open it with --trust): "
+            "a call of builtins.exec",
         ),
         (normalization, pickle.dumps(Poison()), "it does not hold a VecNormalize"),
     ):
