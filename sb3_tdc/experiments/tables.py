@@ -198,11 +198,17 @@ def _late_means(runs: Sequence[Run], column: str) -> np.ndarray:
 
 
 def _over_seeds(values: np.ndarray) -> str:
+    """``"87.2 ± 35"``; without a ± where there is one seed, or all have the same value."""
     known = values[np.isfinite(values)]
     if not len(known):
         return "–"
-    mean, std = f"{known.mean():.3g}", statistics.spread(known)
-    return (mean if np.isnan(std) else f"{mean} ± {std:.2g}").replace("-", "−")
+    mean, std = _rounded(known.mean(), 3), statistics.spread(known)
+    return (f"{mean} ± {_rounded(std, 2)}" if std > 0 else mean).replace("-", "−")
+
+
+def _rounded(value: float, digits: int) -> str:
+    """113.4 with 2 digits → "110", and not "1.1e+02"."""
+    return f"{float(f'{value:.{digits}g}'):g}"
 
 
 def _with_interval(mean: float, low: float, high: float) -> str:

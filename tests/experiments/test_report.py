@@ -47,7 +47,9 @@ def test_table_by_hand(tmp_path):
 def test_what_lam_does_late_in_training(tmp_path):
     for seed, late in ((1, 0.1), (2, 0.3)):
         log = {
+            "train/lam": [0.9] * 3,
             "train/lam_changes": [0.9, 0.9, late],
+            "train/lowered": [0.0, 0.0, 1000.0 * seed],
             "eval/overestimation": [np.nan, -9.0, -50.0 * seed],
         }
         make_run(tmp_path, seed=seed, lam=0.9, log=log)
@@ -58,7 +60,9 @@ def test_what_lam_does_late_in_training(tmp_path):
     assert (row["Algorithm"], row["Seeds"]) == ("TDC", 2)
     assert row["Choices changed, %"] == "20 ± 14"  # of 10 and 30
     assert row["Overestimation"] == "−75 ± 35"
-    assert "λ" not in row
+    assert row["λ"] == "0.9"  # of all seeds
+    assert row["Lowers the target by"] == "1500 ± 710"
+    assert "κ" not in row
 
 
 def test_numbers_to_read():
