@@ -59,7 +59,7 @@ _OPTIONS: dict[str, tuple[type, tuple[str, ...]]] = {
 }
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 _OF_NOISE = ("noise_type", "noise_std")
-# Wrappers with statistics that the policy depends on, and that nobody would save with it
+# Wrappers with statistics that the policy depends on, and that are not saved with it
 _NORMALIZING = (VecNormalize, NormalizeObservation)
 
 
@@ -265,12 +265,14 @@ def _without_other_noise(entry: dict[str, Any], overrides: dict[str, Any]) -> di
 
 def _check_noise(values: dict[str, Any], where: str) -> None:
     noise_type, sigmas = values.get("noise_type"), values.get("noise_std")
-    if "action_noise" in values and any(key in values for key in _OF_NOISE):
+    if values.get("action_noise") is not None and noise_type is not None:
         raise ValueError(f"{where}: the noise must be either action_noise, or noise_type and noise_std, got both")
     if noise_type not in (None, *_NOISE_TYPES):
         raise ValueError(f"{where}: noise_type must be one of {', '.join(_NOISE_TYPES)}, got {noise_type!r}")
     if noise_type is not None and sigmas is None:
         raise ValueError(f"{where}: noise_type {noise_type} requires noise_std")
+    if sigmas and "noise_type" not in values:
+        raise ValueError(f"{where}: noise_std requires noise_type, one of {', '.join(_NOISE_TYPES)}")
     if isinstance(sigmas, list) and (len(sigmas) != 2 or noise_type != "normal"):
         raise ValueError(f"{where}: noise_std must be a number, or two with noise_type normal, got {sigmas}")
 

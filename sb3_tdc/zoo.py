@@ -107,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     from rl_zoo3.train import train
 
     command, *arguments = argv
-    relevant = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    relevant = argparse.ArgumentParser(add_help=False)
     relevant.add_argument("--algo")
     chosen, _ = relevant.parse_known_args(arguments)
     if command == "train" and chosen.algo in ("tdc", "meow"):

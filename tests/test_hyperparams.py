@@ -181,9 +181,10 @@ def test_values_become_what_the_constructor_wants():
         ({"noise_type": "pink"}, "noise_type must be one of normal, ornstein-uhlenbeck, got 'pink'"),
         ({"noise_type": "normal"}, "noise_type normal requires noise_std"),
         (
-            {"noise_type": None, "action_noise": 0.1},
+            {"noise_type": "normal", "noise_std": 0.1, "action_noise": 0.1},
             "must be either action_noise, or noise_type and noise_std",
         ),
+        ({"noise_std": 0.3}, "noise_std requires noise_type, one of normal, ornstein-uhlenbeck"),
         ({"n_envs": 0}, "n_envs must be an integer of at least 1, got 0"),
         ({"noise_type": "normal", "noise_std": -0.1}, "noise_std must be a finite number of at least 0.0, got -0.1"),
         ({"noise_std": float("nan")}, "noise_std must be a finite number of at least 0.0, got nan"),

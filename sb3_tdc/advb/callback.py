@@ -16,10 +16,10 @@ class BoardCallback(BaseCallback):
 
     Test episodes cost steps that ``num_timesteps`` does not count: they are logged as ``board/test_steps``.
 
-    :param test_env: one separate environment, wrapped as that of the training; where that normalises, the test
-        environment gets its statistics, and leaves rewards as they are
+    :param test_env: one separate environment, wrapped like that of the training; if it normalises, it is given the
+        training's statistics and leaves rewards as they are
     :param verbose: 1 prints every new member
-    :raises ValueError: when training begins, if only one of the two environments is wrapped in ``VecNormalize``
+    :raises ValueError: when training begins, if only one of the two is wrapped in ``VecNormalize``
     """
 
     def __init__(self, test_env: VecEnv, verbose: int = 0):

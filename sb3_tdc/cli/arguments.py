@@ -110,7 +110,7 @@ def add_trust(parser: Parser) -> None:
     parser.add_argument("--trust", action="store_true", help=help)
 
 
-def warn_of_trust(is_given: bool) -> None:
+def warn_about_trust(is_given: bool) -> None:
     """Say what ``--trust`` means, if it is given."""
     if is_given:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tdc.advb.policies import AdvisedPolicy
 from sb3_tdc.algorithms import ALGORITHMS
-from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_of_trust
+from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.returns import steps_until_negligible
 from sb3_tdc.common.threads import set_threads
@@ -315,7 +315,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
 
 def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
     args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
-    warn_of_trust(args.trust)
+    warn_about_trust(args.trust)
     _check_arguments(args)
     set_threads(args.num_threads)
     trained = find_trained(args, given)

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_of_trust
+from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
 from sb3_tdc.common.words import count
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         runs, unreadable = find_runs(args.logs)
     except ValueError as error:
         parser.fail(error)
-    warn_of_trust(args.trust)
+    warn_about_trust(args.trust)
     failed = list(unreadable)
     for run in runs:
         if not run.is_finished:

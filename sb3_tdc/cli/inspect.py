@@ -56,6 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     path = args.path
     if not path.exists():
         parser.fail(ValueError(f"{escaped(str(path))} does not exist"))
+    if path.is_dir() and args.algo is not None:
+        parser.fail(ValueError("--algo is for the zip of a model: the folder of a run names its own"))
     try:
         lines, is_good = inspect_run(path) if path.is_dir() else inspect(path, ALGORITHMS.get(args.algo))
     except ValueError as error:

@@ -1,18 +1,17 @@
 """``sb3-tdc publish LOGS``: copy the small files of finished runs into a folder that can be committed."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made
-from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.experiments import final_episodes as test_returns
 from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.publish import RESULTS, publish
 from sb3_tdc.experiments.results import Run, find_runs
-from sb3_tdc.safe_load.run_files import packages_of
+from sb3_tdc.runs.trained import flags_to_open
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,12 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for text in [*unreadable, *refused]:
         print(text, file=sys.stderr)
     if untested:
-        play = _command_to_evaluate(args.logs, untested.values())
+        play = command("evaluate", args.logs, *flags_to_open(run.folder for run in untested.values()))
         print(f"Without test episodes: {', '.join(map(str, untested))} ({play})")
     return int(bool(untested or refused) or not to_publish)
-
-
-def _command_to_evaluate(logs: Path, runs: Iterable[Run]) -> str:
-    """Return the command that plays the test episodes of runs, with the packages that these ask for."""
-    packages = dict.fromkeys(escaped(str(name)) for run in runs for name in packages_of(run.folder.args))
-    return command("evaluate", logs, *(["--gym-packages", *packages] if packages else []))

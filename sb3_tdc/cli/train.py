@@ -5,7 +5,7 @@ import time
 from collections.abc import Sequence
 from datetime import timedelta
 
-from sb3_tdc.cli.arguments import Parser, add_settings
+from sb3_tdc.cli.arguments import Parser, add_settings, warn_about_trust
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.diagnostics import NonFiniteError
 from sb3_tdc.common.output import harmless_output, warnings_as_sentences
@@ -15,8 +15,8 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import needs_trust
 from sb3_tdc.runs.settings import RunSettings
 from sb3_tdc.runs.setup import make_run, resume_run
+from sb3_tdc.runs.trained import flags_to_open
 from sb3_tdc.runs.training import NotSavedError, SetupError, TrainingError, TrainingOutcome, TrainingRun, train
-from sb3_tdc.safe_load.run_files import refused_imports
 
 _TUNE = "to search hyperparameters: sb3-tdc tune (--search, --samples, --seeds, --jobs)"
 _TRACK = "a run writes TensorBoard files into its folder; `wandb sync` uploads them"
@@ -76,6 +76,7 @@ def _main(argv: Sequence[str] | None) -> int:
     parser = make_parser()
     settings, given = RunSettings(**vars(parser.parse_args(argv))), parser.parse_given(argv)
     start = time.monotonic()
+    warn_about_trust(settings.trust)
     try:
         run = make_run(settings) if settings.resume is None else resume_run(given)
     except ValueError as error:
@@ -138,14 +139,8 @@ def _print_how_to_continue(argv: Sequence[str] | None, run: TrainingRun, outcome
 
 
 def _command_to_watch(run: TrainingRun) -> str:
-    """Return the command that plays the model, with the consent to the user's own code that it requires."""
-    modules = dict.fromkeys(module for module, _ in refused_imports(run.settings.as_plain(), run.hyperparams.raw))
-    packages = ["--gym-packages", *modules] if modules else []
-    return command("enjoy", run.folder.path, *packages, *_trust(run))
-
-
-def _trust(run: TrainingRun) -> list[str]:
-    return ["--trust"] if needs_trust(run.folder.model, run.settings.algo) else []
+    """Return the command that plays the model."""
+    return command("enjoy", run.folder.path, *flags_to_open([run.folder]))
 
 
 def _command_to_continue(argv: Sequence[str] | None, run: TrainingRun, n_timesteps: int) -> str:
@@ -153,5 +148,7 @@ def _command_to_continue(argv: Sequence[str] | None, run: TrainingRun, n_timeste
     without = Parser("")
     without.add_argument("-n", "--n-timesteps")
     without.add_argument("-i", "--trained-agent")
+    without.add_argument("--trust", action="store_true")
     _, others = without.parse_known_args(sys.argv[1:] if argv is None else argv)
-    return command("train", "-n", n_timesteps, "-i", run.folder.model, *_trust(run), *others)
+    trust = ["--trust"] if needs_trust(run.folder.model, run.settings.algo) else []
+    return command("train", "-n", n_timesteps, "-i", run.folder.model, *trust, *others)

@@ -44,7 +44,8 @@ class VectorizedNormalNoise(VectorizedActionNoise):
         self.base_noise = base_noise
         ends = [getattr(base_noise, name, base_noise._sigma) for name in ("smallest", "largest")]
         mean, smallest, largest = np.broadcast_arrays(base_noise._mu, *ends)
-        self.mean, self.sigma = np.stack([mean] * self.n_envs), np.linspace(smallest, largest, self.n_envs)
+        self.mean = np.stack([mean] * self.n_envs).astype(float)
+        self.sigma = np.linspace(smallest, largest, self.n_envs)
 
     def __call__(self) -> np.ndarray:
         dtype: Any = self.base_noise._dtype  # type: ignore[attr-defined]
@@ -102,13 +103,24 @@ def noise_of_all(noise: ActionNoise, n_envs: int) -> ActionNoise:
     return noise
 
 
+def _of_every_action(noise: ActionNoise, shape: tuple[int, ...]) -> ActionNoise:
+    """Return noise given by two numbers as that of actions of a shape: NumPy would draw one number for all of them."""
+    one: Any = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
+    if type(one) is not NormalActionNoise or np.ndim(one._mu) > 0 or np.ndim(one._sigma) > 0:
+        return noise
+    return NormalActionNoise(np.full(shape or (1,), one._mu), np.full(shape or (1,), one._sigma), one._dtype)
+
+
 class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
     """An off-policy algorithm whose ``action_noise`` may be a number, and fits any actions and environments."""
 
     @property
     def action_noise(self) -> ActionNoise | None:
         """Exploration noise. A number put here becomes Gaussian noise, and noise of one environment that of all."""
-        return vars(self)["action_noise"]
+        try:
+            return vars(self)["action_noise"]
+        except KeyError:
+            raise AttributeError("action_noise") from None
 
     @action_noise.setter
     def action_noise(self, noise: ActionNoise | float | None) -> None:
@@ -116,13 +128,11 @@ class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
         if noise is not None and not isinstance(noise, ActionNoise):
             sigma = check_number("action_noise (if not an ActionNoise or None)", noise, 0.0)
             if action_space is not None:  # without one, a saved model is being loaded
-                shape = action_space.shape or (1,)
-                noise = NormalActionNoise(np.zeros(shape), np.full(shape, sigma))
+                noise = NormalActionNoise(np.zeros(()), np.full((), sigma))
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
             noise = noise.base_noise
-        if type(noise) is NormalActionNoise and np.ndim(noise._mu) == np.ndim(noise._sigma) == 0:
-            # NumPy draws a number then, and SB3 calls a method of an array
-            noise = NormalActionNoise(np.atleast_1d(noise._mu), np.atleast_1d(noise._sigma), noise._dtype)
+        if isinstance(noise, ActionNoise) and action_space is not None:
+            noise = _of_every_action(noise, action_space.shape)
         if isinstance(noise, ActionNoise) and not isinstance(noise, VectorizedActionNoise):
             noise = noise_of_all(noise, n_envs)
         vars(self)["action_noise"] = noise

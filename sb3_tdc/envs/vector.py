@@ -137,7 +137,8 @@ class GymnasiumVecEnv(VecEnv):
 
     @property
     def _envs(self) -> Sequence[gym.Env] | None:
-        return getattr(self.env, "envs", None)
+        envs = getattr(self.env, "envs", None)
+        return envs if envs and all(isinstance(env, gym.Env) for env in envs) else None
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         chosen = self._choose("set_attr", indices)
@@ -147,7 +148,7 @@ class GymnasiumVecEnv(VecEnv):
             return
         if not hasattr(self.env, "set_attr"):
             raise AttributeError(f"{self.env} cannot set attributes of its environments ({attr_name})")
-        self.env.set_attr(attr_name, value)
+        self.env.set_attr(attr_name, [value] * self.num_envs)  # Gymnasium takes a list as a value for each
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         chosen = self._choose("env_method", indices)

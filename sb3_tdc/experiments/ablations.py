@@ -1,8 +1,8 @@
 """
 Variants of TDC that the experiments compare (docs/lambda.md), and that the package does not offer as options.
 
-Their names begin with that of TDC, whose hyperparameters they have. The commands know them, ``load_safely`` if it is
-told the class.
+Their names begin with that of TDC, whose hyperparameters they have. The commands know them; ``load_safely``
+needs the class as ``algorithm``.
 """
 
 from typing import ClassVar

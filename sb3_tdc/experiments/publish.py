@@ -8,13 +8,14 @@ import shlex
 import shutil
 from os.path import abspath
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.experiments import final_episodes as test_returns
-from sb3_tdc.experiments.results import Run, check_same_run
+from sb3_tdc.experiments.results import Run, check_same_run, flatten
 from sb3_tdc.runs.settings import RunSettings, flags_of
 
 RESULTS = Path("results")
@@ -69,12 +70,23 @@ def _check_is_copy(place: Path, run: Run) -> None:
     """:raises ValueError: if there is a run in a place, and it is no earlier copy of the one to publish"""
     if not any(place.glob("*/args.yml")):
         return
-    there = Run.open(place)
+    try:
+        there = Run.open(place)
+    except ValueError as error:
+        raise ValueError(f"{error}; remove {place} to publish it anew") from error
     if there.folder.model.is_file() or place.samefile(run.folder.path):
         raise ValueError(f"{place} is itself a run, not the copy of one: choose another folder")
-    check_same_run(
-        place, *({"algo": one.algo, "env": one.env_id, "seed": one.seed, **one.settings} for one in (there, run))
-    )
+    check_same_run(place, *(_identity(one, _may_differ(there) | _may_differ(run)) for one in (there, run)))
+
+
+def _identity(run: Run, may_differ: set[str]) -> dict[str, Any]:
+    settings = {"algo": run.algo, "env": run.env_id, "seed": run.seed, **run.settings}
+    return {key: value for key, value in settings.items() if key not in may_differ}
+
+
+def _may_differ(run: Run) -> set[str]:
+    """Return the settings that may be changed when a run is resumed, or were: it is the same run."""
+    return {"n_timesteps", "changes", *(key for each in run.folder.changes for key in flatten(each["hyperparams"]))}
 
 
 def _mirror(source: Path, target: Path, is_valid: bool = True) -> None:

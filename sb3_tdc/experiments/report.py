@@ -14,10 +14,7 @@ from sb3_tdc.common.words import count, listed
 from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import Group, group_runs
 from sb3_tdc.experiments.results import Run
-from sb3_tdc.experiments.sections import Report
-
-# What a report has written next to its page, one path a line: the next one removes these
-_LIST = "report_files.txt"
+from sb3_tdc.experiments.sections import LIST, Report
 
 
 def warnings(groups: Sequence[Group]) -> list[str]:
@@ -60,10 +57,11 @@ def _describe_board(group: Group) -> str:
 
 def _remove_old(folder: Path) -> None:
     """Remove figures and tables of an earlier report, and nothing else: some may be of runs that are gone."""
-    if (folder / _LIST).is_file():
-        for name in (folder / _LIST).read_text(encoding="utf-8").splitlines():
+    if (folder / LIST).is_file():
+        for name in (folder / LIST).read_text(encoding="utf-8").splitlines():
             if re.fullmatch(r"(figures|tables)/[^/]+", name) and (folder / name).is_file():
                 (folder / name).unlink()
+        (folder / LIST).unlink()
 
 
 def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -> Path:
@@ -108,5 +106,4 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
-    (folder / _LIST).write_text("".join(f"{name}\n" for name in report.files), encoding="utf-8")
     return path

@@ -188,7 +188,7 @@ def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
     :return: every run, folder after folder, in the order of its path, and a sentence for each that cannot be read
     :raises ValueError: if there is none below one of the folders
     """
-    runs, unreadable = [], []
+    runs, unreadable, seen = [], [], set()
     for folder in folders:
         configs = (below / "config.yml" for below in _folders_below(folder))
         paths = sorted({config.parents[1] for config in configs if config.is_file()}, key=_by_number)
@@ -196,6 +196,9 @@ def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
             reason = "no <algorithm>/<environment>_<number>/<environment>/config.yml"
             raise ValueError(f"There are no runs in {folder}: {reason}")
         for path in paths:
+            if (real := path.resolve()) in seen:
+                continue
+            seen.add(real)
             try:
                 runs.append(Run.open(path))
             except ValueError as error:

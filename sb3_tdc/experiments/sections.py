@@ -24,6 +24,9 @@ from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import ISAAC, MUJOCO, PYBULLET
 from sb3_tdc.experiments.variants import compare_variants
 
+# What a report has written next to its page, one path a line: the next report removes these
+LIST = "report_files.txt"
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -53,15 +56,15 @@ class Report:
 
     def __init__(self, groups: Sequence[Group], folder: Path):
         self.groups, self.folder = groups, folder
-        self.files: list[str] = []  # written so far, relative to the folder
         self.returns = tables.make_returns_table(groups)
         self.conditions = by_conditions(groups, (*MUJOCO, *PYBULLET, *ISAAC))
 
     def new_file(self, name: str) -> Path:
-        """Return where a file of the report is written, and remember it."""
+        """Return where a file of the report is written, and add it to the list."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.files.append(name)
+        with (self.folder / LIST).open("a", encoding="utf-8") as files:
+            files.write(f"{name}\n")
         return path
 
     def draw(self, name: str, caption: str, function: Callable[..., None], *args: Any, **kwargs: Any) -> Picture:

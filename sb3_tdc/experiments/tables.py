@@ -203,7 +203,8 @@ def _over_seeds(values: np.ndarray) -> str:
     if not len(known):
         return "–"
     mean, std = _rounded(known.mean(), 3), statistics.spread(known)
-    return (f"{mean} ± {_rounded(std, 2)}" if std > 0 else mean).replace("-", "−")
+    is_one_value = len(known) == 1 or np.ptp(known) <= 1e-9 * np.abs(known).max()
+    return (mean if is_one_value else f"{mean} ± {_rounded(std, 2)}").replace("-", "−")
 
 
 def _rounded(value: float, digits: int) -> str:

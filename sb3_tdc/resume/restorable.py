@@ -1,5 +1,6 @@
 """The access of a run to environments in other processes."""
 
+import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -15,11 +16,14 @@ class Restorable(gym.Wrapper):
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # a property in Wrapper, too
-        """The environment's spec without the functions that it may hold, which cannot be sent from another process."""
+        """The environment's spec, in short where it cannot be sent to another process: it may hold functions."""
         spec = self.env.spec
-        if spec is None:
-            return None
-        return EnvSpec(spec.id, reward_threshold=spec.reward_threshold, max_episode_steps=spec.max_episode_steps)
+        try:
+            pickle.dumps(spec)
+        except Exception:  # whatever an object raises that cannot be pickled
+            assert spec is not None
+            return EnvSpec(spec.id, reward_threshold=spec.reward_threshold, max_episode_steps=spec.max_episode_steps)
+        return spec
 
     def capture_state(self) -> dict[str, Any]:
         """Capture the environment, as :func:`~sb3_tdc.resume.environments.capture_env` does."""

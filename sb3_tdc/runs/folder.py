@@ -93,9 +93,9 @@ class RunFolder:
     @classmethod
     def around(cls, model: Path, env_id: str) -> "RunFolder":
         """
-        Return the folder that a model lies in, with what lies there for it.
+        Return the folder that a model lies in: that of a run, also if the model was copied there.
 
-        :param env_id: names what lies next to a model that is not in the folder of a run
+        :param env_id: of the model; where the folder is not of a run, files next to the model are named after it
         """
         try:
             return cls.open(model.parent)

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from sb3_tdc.runs.callbacks.finite_guard import check_weights
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, read_data
 from sb3_tdc.safe_load.fields import on_the_command_line
-from sb3_tdc.safe_load.models import read_model_fields
+from sb3_tdc.safe_load.models import names_code, read_model_fields
 
 # A full disk; PyTorch reports it in its own way
 DISK_ERRORS = (OSError, RuntimeError)
@@ -38,7 +38,7 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
 
     :param algo: a key of ``ALGORITHMS``
     :param kwargs: further arguments of the algorithm's constructor
-    :raises ValueError: if the policy, the networks or the replay buffer are for others, or the memory is too small
+    :raises ValueError: if the policy, the networks or the replay buffer do not fit the environment, or memory is short
     """
     space = env.observation_space
     check_observation_space(space)
@@ -124,13 +124,14 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
 
 
 def needs_trust(path: Path, algo: str) -> bool:
-    """Return whether a saved model names code that :func:`load_model` refuses, a class of the user's for instance."""
+    """Return whether a saved model is refused by :func:`load_model` for code that it names, such as a custom class."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             read_model_fields(path, ALGORITHMS[algo])
     except UnsafeFileError:
-        return True
+        with suppress(UnsafeFileError):  # damaged: --trust would not help
+            return names_code(path)
     return False
 
 
@@ -164,7 +165,8 @@ def save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
 def _action_noise(hyperparams: Hyperparams, env: VecEnv) -> dict[str, Any]:
     """Return the keyword argument for RL Zoo's ``noise_type``, if it is given; null is no noise."""
     if hyperparams.noise_type is None:
-        return {"action_noise": None} if "noise_type" in hyperparams.raw else {}
+        is_none = "noise_type" in hyperparams.raw and "action_noise" not in hyperparams.model
+        return {"action_noise": None} if is_none else {}
     # Of actions without axes: what fits, added to those of one environment and of several, in SB3's classes too
     shape = env.action_space.shape or ((1,) if env.num_envs == 1 else ())
     zeros, sigmas = np.zeros(shape), [np.full(shape, sigma) for sigma in np.atleast_1d(hyperparams.noise_std)]

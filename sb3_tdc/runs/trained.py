@@ -1,6 +1,6 @@
 """Open a finished run: its model with the environment that it was trained in."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,13 +9,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.registry import has_vector_env, import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.runs.models import load_model
-from sb3_tdc.safe_load.run_files import check_arguments, check_imports
+from sb3_tdc.runs.models import load_model, needs_trust
+from sb3_tdc.safe_load.run_files import check_arguments, check_imports, refused_imports
 
 # What of a run's hyperparameters the environments are made of
 _OF_THE_ENVIRONMENT = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper", "env_kwargs")
@@ -124,6 +125,14 @@ def _find_normalization(run: RunFolder, path: Path) -> Path:
             f"{run.normalization(run.model)} is missing: {path.name} was trained on normalised observations"
         )
     return found
+
+
+def flags_to_open(runs: Iterable[RunFolder]) -> list[str]:
+    """Return the flags with which ``enjoy`` and ``evaluate`` open runs: the consent to the user's own code in them."""
+    runs = list(runs)
+    modules = dict.fromkeys(escaped(module) for run in runs for module, _ in refused_imports(run.args, run.config))
+    trust = any(needs_trust(run.model, run.args["algo"]) for run in runs if run.model.is_file())
+    return [*(["--gym-packages", *modules] if modules else []), *(["--trust"] if trust else [])]
 
 
 def open_zip(path: Path, algo: str, env_id: str, trust: bool = False) -> TrainedModel:

@@ -114,7 +114,7 @@ _REMEDY = re.compile(r"\(custom_objects can \w+ it\)")
 
 
 def on_the_command_line(sentence: str) -> str:
-    """Return why a file is refused as a command says it: there, ``custom_objects`` is no flag."""
+    """Return a refusal in the words of the command line, where ``custom_objects`` is not a flag."""
     return _REMEDY.sub("(if you know its origin, enjoy, evaluate and train open it with --trust)", sentence)
 
 

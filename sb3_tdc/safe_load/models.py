@@ -16,6 +16,7 @@ from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.fields import (
     TEMPERATURE,
     check_replay_memory,
+    foreign_names,
     parse_data,
     read_fields,
 )
@@ -115,6 +116,17 @@ def read_data(path: str | Path) -> dict[str, Any]:
     with reading(f"{path} is not the zip of a saved model"):
         with open_regular(path, MAX_BYTES) as (file, size):
             return parse_data(read_archive(file, MODEL_ENTRIES, Budget(size))["data"])
+
+
+def names_code(path: str | Path) -> bool:
+    """
+    Return whether SB3's ``load`` would run code for a field of a saved model.
+
+    :raises UnsafeFileError: if it is not the zip of a saved model
+    """
+    with reading(f"{path} is not the zip of a saved model"):
+        budget = Budget(Path(path).stat().st_size)
+        return any(foreign_names(value, budget) for value in read_data(path).values())
 
 
 def _make_model(

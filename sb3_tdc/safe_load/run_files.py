@@ -59,16 +59,6 @@ def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where:
         raise ValueError(f"{where}: algo must be one of {', '.join(algorithms)}, got {shown(args['algo'])}")
 
 
-def packages_of(args: Mapping[str, Any]) -> list[str]:
-    """
-    Return the packages that a run asks for, to register its environment.
-
-    :param args: of ``args.yml``
-    """
-    package, _, _ = args["env"].rpartition(":")
-    return [*(args.get("gym_packages") or []), *([package] if package else [])]
-
-
 def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str], where: str) -> None:
     """
     Check that the files of a run name no code but what is known or consented to.
@@ -86,7 +76,8 @@ def refused_imports(
     args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str] = ()
 ) -> Iterator[tuple[str, str]]:
     """Return the module of all code that :func:`check_imports` refuses, each with what is asked for and the remedy."""
-    for name in packages_of(args):
+    package, _, _ = args["env"].rpartition(":")
+    for name in [*(args.get("gym_packages") or []), *([package] if package else [])]:
         if name not in consented:
             yield name, f"the package {escaped(name)}: if you know it, add --gym-packages {escaped(name)}"
     for key, name, kwargs in _wrappers(config):

@@ -81,6 +81,17 @@ def test_noise_of_actions_without_axes(algorithm, n_envs, noise):
     assert model.replay_buffer.actions.shape[1:] == (n_envs, 1)
 
 
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("algorithm", [TDC, MEOW, AdvBTD3])
+@pytest.mark.parametrize("is_of_all", [False, True])
+def test_a_number_is_noise_of_every_action_on_its_own(algorithm, n_envs, is_of_all):
+    noise = NormalActionNoise(0.0, 0.1)
+    noise = VectorizedActionNoise(noise, n_envs) if is_of_all else noise
+    model = algorithm("MlpPolicy", make_vec_env(TwoActions, n_envs), action_noise=noise, buffer_size=100)
+    drawn = np.stack([model.action_noise() for _ in range(2000)]).reshape(2000, -1)
+    np.testing.assert_allclose(np.cov(drawn.T), 0.01 * np.eye(2 * n_envs), atol=0.002)
+
+
 @pytest.mark.parametrize("algorithm", [MEOW, AdvBTD3])
 def test_noise_fits_the_environments_that_a_model_is_opened_for(tmp_path, algorithm):
     settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}

@@ -216,6 +216,22 @@ def test_a_run_is_published_again_with_what_it_has_by_now(tmp_path):
     assert final_episodes.read_test_returns(find_runs(tmp_path / "results")[0][0]).tolist() == [5, 6]
 
 
+def test_a_run_is_published_again_after_what_may_be_changed_of_it(tmp_path, capsys):
+    logs, results = str(tmp_path / "logs"), tmp_path / "results"
+    run = finish(make_run(tmp_path / "logs", lam=1.0, kappa=1.0))
+    publish.main([logs, "-o", str(results)])
+    config = {**run.config, "kappa": 2.0, "n_timesteps": 2000}
+    run.record_change(500, config, ("kappa",))
+    capsys.readouterr()
+    publish.main([logs, "-o", str(results)])
+    assert "is another run" not in capsys.readouterr().err
+    (published,), _ = find_runs(results)
+    assert (published.n_timesteps, published.folder.config["kappa"]) == (2000, 2.0)
+    (published.folder.path / "evaluations.npz").write_bytes(b"damaged")
+    assert publish.main([logs, "-o", str(results)]) == 1
+    assert f"; remove {published.folder.path} to publish it anew" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("part", ["logs/tdc", "logs/tdc/Hopper-v4_1", "."])
 def test_a_part_of_a_log_folder_is_published_in_its_place(tmp_path, monkeypatch, part):
     run = finish(make_run(tmp_path / "logs"))

@@ -65,6 +65,13 @@ def test_what_lam_does_late_in_training(tmp_path):
     assert "κ" not in row
 
 
+def test_a_value_of_all_seeds_has_no_deviation(tmp_path):
+    for seed in (1, 2, 3):  # the mean of three times 0.1 is not quite 0.1
+        make_run(tmp_path, seed=seed, lam=0.1, log={"train/lam": [0.1], "train/lam_changes": [0.1 * seed]})
+    (row,) = tables.make_lam_table(read_groups(tmp_path)).to_dict("records")
+    assert row["λ"] == "0.1"
+
+
 def test_numbers_to_read():
     assert tables.number(1234.5) == "1,234"
     assert tables.number(12.34) == "12.3"

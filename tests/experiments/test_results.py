@@ -72,6 +72,8 @@ def test_runs_behind_links_are_found_once(tmp_path):
         ("tdc/Hopper-v4_1", 1),
         ("tdc/Hopper-v4_2", 2),
     ]
+    again, _ = find_runs(logs / "tdc", logs)
+    assert [run.seed for run in again] == [1, 2, 3]
 
 
 def test_of_several_folders_the_last_counts(tmp_path):
