@@ -146,7 +146,8 @@ def check_saved_by(path: Path, algo: str) -> None:
     modules = {a: {p.__module__ for p in ALGORITHMS[a].policy_aliases.values()} for a in ALGORITHMS}
     others = [a for a in ALGORITHMS if module in modules[a]]
     if others and algo not in others:
-        raise ValueError(f"{path} was saved by {' or '.join(others)}, not by {algo}: --algo {others[0]}")
+        named = list(dict.fromkeys(a.partition("-")[0] for a in others))  # variants are called after their algorithm
+        raise ValueError(f"{path} was saved by {' or '.join(named)}, not by {algo}: --algo {named[0]}")
 
 
 def save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
