@@ -99,7 +99,7 @@ def _main(argv: Sequence[str] | None) -> int:
         _print_how_to_continue(argv, run, outcome)
         return 130
     if settings.verbose > 0:
-        print(f"To watch it: {_command_to_watch(run)}")
+        print(f"To watch it: {command('enjoy', folder.path, *flags_to_open([folder]))}")
     return 0
 
 
@@ -136,11 +136,6 @@ def _print_how_to_continue(argv: Sequence[str] | None, run: TrainingRun, outcome
         experience = "with" if with_buffer else "without (--save-replay-buffer keeps it)"
         print(f"Stopped at step {steps:,} of {total:,}. To continue in a new run, {experience} the replay buffer:")
         print(f"  {_command_to_continue(argv, run, total - steps)}")
-
-
-def _command_to_watch(run: TrainingRun) -> str:
-    """Return the command that plays the model."""
-    return command("enjoy", run.folder.path, *flags_to_open([run.folder]))
 
 
 def _command_to_continue(argv: Sequence[str] | None, run: TrainingRun, n_timesteps: int) -> str:

@@ -58,7 +58,7 @@ def updates_before(tau: float, gamma: float) -> float:
     Return after how many updates a calibration begins: 1/(τ·(1 − γ)).
 
     Values grow from those of new networks to their size over as many: a target takes about 1/τ updates to follow, and
-    the values of 1/(1 − γ) steps follow one another. That they are too small until then is not λ's doing.
+    the values of 1/(1 − γ) steps follow one another. λ is not the reason that they are too small until then.
     """
     horizon = min(1 / (1 - gamma), _MAX_HORIZON) if gamma < 1 else _MAX_HORIZON
     return horizon / tau if tau > 0 else math.inf
