@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 
-from sb3_tdc.experiments.calibration import CalibratedTDC
+from sb3_tdc.ablations.calibration import CalibratedTDC
 
 WARM_UP, STEPS = 1_000, 5_000
 

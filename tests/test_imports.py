@@ -45,3 +45,11 @@ def test_the_commands_that_draw_nothing_choose_mujocos_backend_themselves():
     code = "import sys, sb3_tdc.cli.enjoy, sb3_tdc.cli.train; print('mujoco' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
+
+
+def test_training_and_watching_require_no_extras():
+    """They work with the dependencies of the package alone, as after the README's installation."""
+    extras = {"pandas", "scipy", "jinja2", "ray", "imageio"}
+    code = f"import sys, sb3_tdc.cli.enjoy, sb3_tdc.cli.train, sb3_tdc.cli.inspect; print(*{extras} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

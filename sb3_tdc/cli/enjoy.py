@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.advb.policies import AdvisedPolicy
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
@@ -33,7 +34,6 @@ from sb3_tdc.envs.rendering import (
     follow_agent,
     render_modes,
 )
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import MAX_SEED, RunSettings, check_settings
 from sb3_tdc.runs.trained import TrainedModel, open_run, open_zip

@@ -4,9 +4,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
 from sb3_tdc.common.words import count
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
 from sb3_tdc.experiments.results import find_runs
 

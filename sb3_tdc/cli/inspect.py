@@ -4,10 +4,10 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, one_of
 from sb3_tdc.common.untrusted import escaped
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load.inspect import inspect
 from sb3_tdc.safe_load.run_files import check_arguments, check_imports

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Names, Parser, one_of
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made
 from sb3_tdc.common.output import harmless_output
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.jobs import Job, cluster, count_cores
 from sb3_tdc.experiments.matrix import run_jobs
 from sb3_tdc.experiments.plan import Plan, dry_run, make_plan, read_rates, select

@@ -4,11 +4,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made
 from sb3_tdc.experiments import final_episodes as test_returns
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.publish import RESULTS, publish
 from sb3_tdc.experiments.results import Run, find_runs
 from sb3_tdc.runs.trained import flags_to_open

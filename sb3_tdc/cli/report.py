@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.files import check_writable
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.report import write_report
 from sb3_tdc.experiments.results import find_runs
 

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from sb3_tdc.ablations import know_ablations
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, add_settings, one_of
 from sb3_tdc.common import plain_yaml
@@ -15,7 +16,6 @@ from sb3_tdc.common.files import check_can_be_made, lock, numbered, write_atomic
 from sb3_tdc.common.output import harmless_output
 from sb3_tdc.common.words import count
 from sb3_tdc.envs.registry import import_packages, split_env_id
-from sb3_tdc.experiments.ablations import know_ablations
 from sb3_tdc.experiments.jobs import Job, cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tdc.ablations import ABLATIONS
 from sb3_tdc.experiments import figures, statistics
-from sb3_tdc.experiments.ablations import ABLATIONS
 from sb3_tdc.experiments.groups import Group, as_shipped
 from sb3_tdc.experiments.results import Run
 

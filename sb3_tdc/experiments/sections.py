@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sb3_tdc.ablations import ABLATIONS
 from sb3_tdc.common.words import count, counted, listed
 from sb3_tdc.experiments import figures, provenance, tables
-from sb3_tdc.experiments.ablations import ABLATIONS
 from sb3_tdc.experiments.aggregate import Aggregate, aggregate
 from sb3_tdc.experiments.claims import MIN_SEEDS_OF_SPREAD
 from sb3_tdc.experiments.curves import bin_width, headline, make_curve, read_evaluations, read_td_errors

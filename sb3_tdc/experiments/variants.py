@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from sb3_tdc.ablations import ABLATIONS
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.ablations import ABLATIONS
 from sb3_tdc.experiments.groups import Group, by_conditions, have_same_settings
 from sb3_tdc.tdc import TDC
 

@@ -28,9 +28,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import GoalSelectionStrategy
 
 from sb3_tdc import TDC, UnsafeFileError, load_safely
+from sb3_tdc.ablations.calibration import CalibratedTDC
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import enjoy, inspect
-from sb3_tdc.experiments.calibration import CalibratedTDC
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer
 from sb3_tdc.safe_load.budget import Budget

@@ -26,9 +26,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_tdc import MEOW, TDC
+from sb3_tdc.ablations import calibration
 from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
 from sb3_tdc.envs.registry import require_env, simulator_of
-from sb3_tdc.experiments import calibration
 from sb3_tdc.resume import Restorable, ResumeStates
 
 STEPS = 300

@@ -12,9 +12,9 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_tdc.ablations.calibration import MAX_LAM, CalibratedTDC
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.saved_fields import SavedField, number
-from sb3_tdc.experiments.calibration import MAX_LAM, CalibratedTDC
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import Target
 

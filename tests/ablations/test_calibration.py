@@ -15,9 +15,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc import load_safely
-from sb3_tdc.common.returns import discounted_returns, known_steps
-from sb3_tdc.experiments import calibration
-from sb3_tdc.experiments.calibration import (
+from sb3_tdc.ablations import calibration
+from sb3_tdc.ablations.calibration import (
     MAX_LAM,
     CalibratedTDC,
     Calibration,
@@ -25,6 +24,7 @@ from sb3_tdc.experiments.calibration import (
     calibrate,
     updates_before,
 )
+from sb3_tdc.common.returns import discounted_returns, known_steps
 from sb3_tdc.resume.run_state import _restart_episodes as restart_episodes
 from tests.helpers.tdc import HEADS, TwoActions, make
 

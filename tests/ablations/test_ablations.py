@@ -5,10 +5,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_tdc.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC, know_ablations
+from sb3_tdc.ablations.calibration import CalibratedTDC
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import enjoy, train
-from sb3_tdc.experiments.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC, know_ablations
-from sb3_tdc.experiments.calibration import CalibratedTDC
 from sb3_tdc.hyperparams import hyperparams_file
 from sb3_tdc.runs.models import load_model
 from tests.helpers.tdc import BATCH, SMALL, random_batches
