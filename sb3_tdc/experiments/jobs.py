@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.files import lock
 from sb3_tdc.experiments.results import Run, check_same_run
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.resume import DEFAULT_FREQ
@@ -27,6 +28,10 @@ from sb3_tdc.runs.settings import Role, defaults
 _POLL_SECONDS = 0.2
 _SECONDS_TO_ANSWER = 5.0
 _EVAL_FREQ: int = defaults(Role.EXPERIMENT)["eval_freq"]
+
+
+class TrainedElsewhereError(ValueError):
+    """Another process trains this run."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,17 @@ class Job:
         return folder is not None and folder.is_finished
 
     @property
+    def is_trained_elsewhere(self) -> bool:
+        """Whether another process trains it now."""
+        if not self.log.is_file():
+            return False
+        log = lock(self.log)
+        if log is None:
+            return True
+        log.close()
+        return False
+
+    @property
     def _env_name(self) -> str:
         return folder_name(self.env_id)
 
@@ -120,11 +136,15 @@ class Job:
         Start the run, or resume it.
 
         :return: the process; it stops with a resume state on SIGTERM, and at once if this process dies
+        :raises TrainedElsewhereError: if another process trains this run
         """
-        folder = self.run_folder
-        arguments = self.arguments if folder is None else ["--resume", str(folder.path)]
         self.log.parent.mkdir(parents=True, exist_ok=True)
-        with self.log.open("a") as log:
+        log = lock(self.log)  # which the process inherits: it is locked as long as the run, or a part of it, lives
+        if log is None:
+            raise TrainedElsewhereError(f"{self}: another process trains it")
+        with log:
+            folder = self.run_folder
+            arguments = self.arguments if folder is None else ["--resume", str(folder.path)]
             return subprocess.Popen(
                 [sys.executable, "-m", "sb3_tdc", "job", *arguments],
                 stdin=subprocess.PIPE,
@@ -165,13 +185,16 @@ def stop(processes: Sequence[subprocess.Popen]) -> None:
             process.stdin.close()
 
 
-def run(job: Job) -> int:
+def run(job: Job) -> int | None:
     """
     Run a job to its end; if it is interrupted, it stops with a resume state.
 
-    :return: the exit status of ``sb3-tdc train``
+    :return: the exit status of ``sb3-tdc train``; None if another process trains the run
     """
-    process = job.start()
+    try:
+        process = job.start()
+    except TrainedElsewhereError:
+        return None
     try:
         while process.poll() is None:
             time.sleep(_POLL_SECONDS)

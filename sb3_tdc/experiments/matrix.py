@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -10,6 +11,7 @@ from typing import Any
 from sb3_tdc.experiments.jobs import Job, run
 
 _SECONDS_TO_STOP = 60.0
+_SECONDS_UNTIL_ASKED_AGAIN = 5.0
 
 
 @dataclass
@@ -27,29 +29,30 @@ class MatrixOutcome:
 
 def run_jobs(ray: Any, jobs: Sequence[Job], n_jobs: int | None) -> MatrixOutcome:
     """
-    Run jobs, several at once.
+    Run jobs, several at once. One that another process trains is left to it, and looked at again until it is finished.
 
     :param ray: the module, initialised
     :param n_jobs: how many at once; None for as many as Ray has CPUs
     """
     # One CPU each, and one thread (in a job's arguments); a job whose machine is lost is started again, and resumes
     execute = ray.remote(num_cpus=1, max_retries=2)(run)
-    waiting, outcome = list(reversed(jobs)), MatrixOutcome([])
+    queue, outcome = _Queue(jobs), MatrixOutcome([])
     running: dict[Any, tuple[Job, float]] = {}
     try:
-        while waiting or running:
-            while waiting and len(running) < (n_jobs or int(ray.cluster_resources().get("CPU", 1))):
-                job = waiting.pop()
+        while queue or running:
+            while len(running) < (n_jobs or int(ray.cluster_resources().get("CPU", 1))) and (job := queue.pop()):
                 print(f"{'resume' if job.run_folder else 'run':6} {job}", flush=True)
                 running[execute.remote(job)] = job, time.monotonic()
-            ended, _ = ray.wait(list(running), timeout=1.0)
-            for reference in ended:
+            for reference in _wait(ray, list(running)):
                 job, start = running.pop(reference)
                 why = _why_failed(ray, reference, job)
+                if why is None:
+                    queue.put_off(job)
+                    continue
                 outcome.failed += [f"{job}: {why}"] if why else []
                 took = timedelta(seconds=round(time.monotonic() - start))
                 result = "FAILED" if why else f"return {job.final_return:.1f}" if job.final_return is not None else ""
-                progress = f"[{len(jobs) - len(waiting) - len(running)}/{len(jobs)}]"
+                progress = f"[{len(jobs) - len(queue) - len(running)}/{len(jobs)}]"
                 print(f"end    {job}, {took}, {result} {progress}", flush=True)
     except KeyboardInterrupt:
         outcome.stopped = True
@@ -61,12 +64,52 @@ def run_jobs(ray: Any, jobs: Sequence[Job], n_jobs: int | None) -> MatrixOutcome
     return outcome
 
 
-def _why_failed(ray: Any, reference: Any, job: Job) -> str:
-    """Return why a job failed, or "" if it is finished."""
+class _Queue:
+    """Jobs in their order; one that another process trains comes last, and again after a while."""
+
+    def __init__(self, jobs: Sequence[Job]):
+        self._jobs = deque((0.0, job) for job in jobs)  # with the time from which each may be started
+        self._elsewhere: list[Job] = []
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def pop(self) -> Job | None:
+        """Return the next job to start; None if there is none now."""
+        while self._jobs and self._jobs[0][0] <= time.monotonic():
+            _, job = self._jobs.popleft()
+            if job.is_trained_elsewhere:
+                self.put_off(job)
+            elif job.is_finished:
+                print(f"end    {job}, by another process", flush=True)
+            else:
+                return job
+        return None
+
+    def put_off(self, job: Job) -> None:
+        """Put back a job that another process trains."""
+        if job not in self._elsewhere:
+            self._elsewhere.append(job)
+            print(f"wait   {job}: another process trains it", flush=True)
+        self._jobs.append((time.monotonic() + _SECONDS_UNTIL_ASKED_AGAIN, job))
+
+
+def _wait(ray: Any, references: list[Any]) -> list[Any]:
+    """Return those that have ended, after a second at most."""
+    if not references:
+        time.sleep(1.0)
+        return []
+    return ray.wait(references, timeout=1.0)[0]
+
+
+def _why_failed(ray: Any, reference: Any, job: Job) -> str | None:
+    """Return why a job failed, "" if it is finished, and None if another process trains it."""
     try:
         status = ray.get(reference)
     except ray.exceptions.RayError as error:
         return " ".join(str(error).split())
+    if status is None:
+        return None
     if status == 0 and job.is_finished:
         return ""
     return "\n  ".join([f"exit status {status}, see {job.log}", *job.last_lines()])

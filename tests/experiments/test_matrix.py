@@ -1,21 +1,26 @@
 """The run matrix: what is run, for how long; then real matrices, killed and resumed."""
 
+import concurrent.futures
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import pytest
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import matrix
+from sb3_tdc.common.files import lock
 from sb3_tdc.experiments import jobs as job_module
+from sb3_tdc.experiments import matrix as running
 from sb3_tdc.experiments import plan as planning
-from sb3_tdc.experiments.jobs import Job, eval_freq
+from sb3_tdc.experiments.jobs import Job, TrainedElsewhereError, eval_freq, stop
 from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.suites import SUITES, Cell
 from sb3_tdc.runs.folder import RunFolder
@@ -123,6 +128,73 @@ def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
     assert (job.steps_done, job.is_finished) == (100, True)
 
 
+class RayOfThreads:
+    """What ``run_jobs`` uses of Ray, in threads of this process."""
+
+    exceptions = SimpleNamespace(RayError=RuntimeError)
+
+    def __init__(self):
+        self.pool = ThreadPoolExecutor()
+
+    def remote(self, **options):
+        return lambda function: SimpleNamespace(remote=lambda job: self.pool.submit(function, job))
+
+    def wait(self, references, timeout):
+        return [list(each) for each in concurrent.futures.wait(references, timeout, "FIRST_COMPLETED")]
+
+    def get(self, reference):
+        return reference.result()
+
+
+def train_in_no_time(job):
+    folder = RunFolder.create(job.logs, job.algo, job.env_id)
+    args = {"algo": job.algo, "env": job.env_id, "seed": job.seed, "eval_freq": eval_freq(job.n_timesteps)}
+    folder.write_config(job.config, args)
+    folder.mark_finished(job.n_timesteps)
+    return 0
+
+
+@pytest.mark.parametrize("finishes", [True, False])
+def test_a_run_that_another_process_trains_is_left_to_it(finishes, tmp_path, monkeypatch, capsys):
+    """The others go on meanwhile; if it stops before its end, the run is taken over."""
+    monkeypatch.setattr(running, "_SECONDS_UNTIL_ASKED_AGAIN", 0.1)
+    trained = []
+    monkeypatch.setattr(running, "run", lambda job: trained.append(job.seed) or train_in_no_time(job))
+    jobs = [Job("tdc", "Pendulum-v1", seed, 100, tmp_path / f"{seed}") for seed in (1, 2, 3)]
+    jobs[0].log.parent.mkdir(parents=True)
+    with ThreadPoolExecutor() as pool:
+        other_process = lock(jobs[0].log)
+        outcome = pool.submit(running.run_jobs, RayOfThreads(), jobs, 1)
+        deadline = time.monotonic() + 30
+        while not jobs[2].is_finished:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        time.sleep(0.5)
+        assert not outcome.done()
+        assert trained == [2, 3]
+        if finishes:
+            train_in_no_time(jobs[0])
+        other_process.close()
+    assert outcome.result().failed == []
+    assert trained == ([2, 3] if finishes else [2, 3, 1])
+    assert capsys.readouterr().out.count("wait   tdc Pendulum-v1 seed 1: another process trains it") == 1
+
+
+def test_a_run_has_one_process(tmp_path):
+    job = Job("tdc", "Pendulum-v1", 1, 10_000, tmp_path, SMALL_TDC)
+    assert not job.is_trained_elsewhere
+    process = job.start()
+    try:
+        assert job.is_trained_elsewhere
+        with pytest.raises(TrainedElsewhereError, match="seed 1: another process trains it"):
+            job.start()
+        assert job_module.run(job) is None
+    finally:
+        process.kill()
+        stop([process])
+    assert not job.is_trained_elsewhere
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -221,6 +293,17 @@ def test_a_matrix_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
     assert len(alone) == len(killed) == 2
     for one, other in zip(alone, killed, strict=True):
         assert fingerprint(one) == fingerprint(other)
+
+
+@pytest.mark.slow
+def test_two_matrices_share_the_runs(tmp_path):
+    both = [start("fig1", tmp_path, "--scale", "0.003", "--jobs", "1") for _ in range(2)]
+    for process in both:
+        out, status = finish(process)
+        assert status == 0, out
+    runs = find_runs(tmp_path)[0]
+    assert [run.is_finished for run in runs] == [True, True]
+    assert {run.folder.path.name for run in runs} == {"Pendulum-v1_1"}
 
 
 @pytest.mark.skipif(not Path("/proc/self/autogroup").exists(), reason="Linux without groups of sessions")
