@@ -32,11 +32,6 @@ def test_from_a_search_to_a_page(tmp_path, capsys):
     assert status == 0, out
     assert "skip   tdc Pendulum-v1" in out  # a cell of both suites is one run
     assert "1 of 2 to run" in out
-    before = run.folder.model.stat().st_mtime_ns
-    out, status = finish(start_matrix("fig2", matrix, *scale))
-    assert status == 1, out
-    assert "1 of 2 runs are finished already" in out
-    assert run.folder.model.stat().st_mtime_ns == before
 
     assert evaluate.main([str(matrix), "--episodes", "2"]) == 0
     assert report.main([str(matrix), "-o", str(tmp_path / "report")]) == 0
