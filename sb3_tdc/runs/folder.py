@@ -118,7 +118,7 @@ class RunFolder:
     @property
     def config(self) -> dict[str, Any]:
         """The hyperparameters as they were read."""
-        return _read_yaml(self.path / self.env_name / "config.yml")
+        return _read_yaml(self._config)
 
     @property
     def args(self) -> dict[str, Any]:
@@ -198,6 +198,10 @@ class RunFolder:
             raise ValueError(f"{self.model} cannot be read ({type(error).__name__}: {error})") from error
 
     @property
+    def _config(self) -> Path:
+        return self.path / self.env_name / "config.yml"
+
+    @property
     def _finished(self) -> Path:
         return self.path / self.env_name / "finished.yml"
 
@@ -226,9 +230,17 @@ class RunFolder:
         return self.path / self.env_name / "vecnormalize.pkl"
 
     def find_normalization(self, model: Path) -> Path | None:
-        """Return the ``VecNormalize`` statistics of one of the run's models, or those of the run, if there are any."""
+        """
+        Return the ``VecNormalize`` statistics of one of the run's models, or those of the run, if there are any.
+
+        :raises ValueError: if there are none, and the run was trained with them
+        """
         # RL Zoo keeps one for all its models
-        return next((path for path in map(self.normalization, (model, self.model)) if path.is_file()), None)
+        found = next((path for path in map(self.normalization, (model, self.model)) if path.is_file()), None)
+        if found is None and self._config.is_file() and self.config.get("normalize"):
+            missing = self.normalization(self.model)
+            raise ValueError(f"{missing} is missing: {model.name} was trained on normalised observations")
+        return found
 
     def replay_buffer(self, model: Path) -> Path:
         """Return where the replay buffer of one of the run's models is."""
@@ -256,7 +268,7 @@ class RunFolder:
         """
         change = {"step": step, "hyperparams": {name: config[name] for name in names}}
         _write_text(self._changes, plain_yaml.dump({"changes": [*self.changes, change]}))
-        _write_text(self.path / self.env_name / "config.yml", plain_yaml.dump(config))
+        _write_text(self._config, plain_yaml.dump(config))
 
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
         """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""

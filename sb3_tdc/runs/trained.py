@@ -107,24 +107,10 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
         hyperparams,
         trained["env_kwargs"] or {},
         trained.get("eval_env_kwargs") or {},
-        _find_normalization(run, path) if hyperparams.normalize is not None else None,
+        run.find_normalization(path) if hyperparams.normalize is not None else None,
         trust,
         vec_env="gymnasium" if trained.get("vec_env") == "gymnasium" and has_vector_env(env_id) else "dummy",
     )
-
-
-def _find_normalization(run: RunFolder, path: Path) -> Path:
-    """
-    Find the statistics of ``VecNormalize`` for a model.
-
-    :raises ValueError: if the statistics that a model needs are missing
-    """
-    found = run.find_normalization(path)
-    if found is None:
-        raise ValueError(
-            f"{run.normalization(run.model)} is missing: {path.name} was trained on normalised observations"
-        )
-    return found
 
 
 def flags_to_open(runs: Iterable[RunFolder]) -> list[str]:

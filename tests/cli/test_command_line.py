@@ -176,6 +176,18 @@ def test_normalisation_goes_on_in_an_environment_of_another_id(tmp_path, capsys)
     assert round(saved.obs_rms.count) == (1 + 120) + (1 + 130)  # the first observation, and one each step
 
 
+@pytest.mark.parametrize("small", [SMALL, [*SMALL, "normalize:true"]])
+def test_normalisation_that_was_lost_does_not_begin_anew(tmp_path, capsys, small):
+    assert run_train(tmp_path, env="Pendulum-v1", n=120, small=[*SMALL, "normalize:true"]) == 0
+    first = tmp_path / "tdc" / "Pendulum-v1_1"
+    statistics = first / "Pendulum-v1" / "vecnormalize.pkl"
+    statistics.unlink()
+    with pytest.raises(SystemExit):
+        run_train(tmp_path, "-i", first / "Pendulum-v1.zip", env="Pendulum-v1", n=130, small=small)
+    assert f"{statistics} is missing: Pendulum-v1.zip was trained on normalised obs" in capsys.readouterr().err
+    assert not (tmp_path / "tdc" / "Pendulum-v1_2").exists()
+
+
 def stop_at_150(self):
     self.requested = self.n_calls == 150
     return not self.requested
