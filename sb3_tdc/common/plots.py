@@ -2,7 +2,7 @@
 
 from typing import Any
 
-_LINES_INSIDE = 4
+_LINES_INSIDE = 2
 
 
 def import_figure() -> Any:

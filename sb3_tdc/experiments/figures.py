@@ -19,7 +19,7 @@ _OF_SB3 = {"TD3": "#D55E00", "SAC": "#009E73", "DDPG": "#CC79A7"}
 COLORS: dict[str, str] = _OF_SB3 | {
     name.upper(): color for name, algorithm in ALGORITHMS.items() if (color := vars(algorithm).get("color")) is not None
 }
-OTHER_COLORS = ("#56B4E9", "#000000", "#7F7F7F", "#8C564B", "#9467BD", "#BCBD22")
+OTHER_COLORS = ("#56B4E9", "#000000", "#8C564B", "#9467BD", "#BCBD22", "#17BECF")  # grey is for published ones
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def draw_curves(
         axes.fill_between(known.steps[here], low[here], high[here], color="grey", alpha=0.15, lw=0)
         shown.append(mean[here])
     values = np.concatenate(shown)
-    axes.set_ylim(*_limits(values[np.isfinite(values)], log))
+    _cut_intervals(axes, values[np.isfinite(values)], log)
     style_axes(axes, title, "environment steps", ylabel)
     axes.xaxis.set_major_formatter(_short_number)
     add_legend(axes, "outside lower left", ncols=2)
@@ -145,8 +145,7 @@ def draw_sweep(
         axes.errorbar(x, y, [y - lows[several], highs[several] - y], fmt="none", color=color, capsize=4, lw=1.2)
     for value, r in zip(values, returns, strict=True):
         axes.scatter(np.full(len(r), value), r, color=color, edgecolor="white", lw=0.6, s=26, zorder=3)
-    everything = np.concatenate(returns)
-    axes.set_ylim(*_limits(everything, log=False))
+    _cut_intervals(axes, np.concatenate(returns))
     few, many = min(map(len, returns)), max(map(len, returns))
     seeds = count_seeds(few) if few == many else f"{few} to {count_seeds(many)}"
     style_axes(axes, title, f"{xlabel} ({seeds} each)", "final return")
@@ -170,15 +169,16 @@ def draw_intervals(
     axes.set_ylim(len(labels) - 0.5, -0.5)
 
 
-def _limits(values: np.ndarray, log: bool) -> tuple[float | None, float | None]:
-    """The range of the values and a third of it on either side."""
+def _cut_intervals(axes: Any, values: np.ndarray, log: bool = False) -> None:
+    """Cut the vertical axis where intervals go further from the values than a third of their range."""
     if not len(values):
-        return None, None
+        return
     low, high = np.log((values.min(), values.max())) if log else (values.min(), values.max())
     margin = (high - low) / 3 or 1.0
     limits = np.array([low - margin, high + margin])
-    low, high = np.exp(limits) if log else limits
-    return float(low), float(high)
+    lowest, highest = np.exp(limits) if log else limits
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(low, lowest), min(high, highest))
 
 
 def _finite(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -116,6 +116,18 @@ def test_one_seed_has_no_band():
     assert drawn == [False, True]
 
 
+@pytest.mark.parametrize("log", [False, True])
+def test_the_axis_fits_what_is_drawn_but_a_huge_interval(log):
+    def limits(*seeds):
+        curve = figures.Curve("TDC", "blue", np.array([10, 20]), np.exp(seeds) if log else np.array(seeds))
+        found = draw(figures.draw_curves, [curve], "A", "return", log=log).get_ylim()
+        return np.log(found) if log else found
+
+    assert limits([1.0, 4.0]) == pytest.approx([1 - 0.05 * 3, 4 + 0.05 * 3])  # Matplotlib's margin: no interval
+    # mean 2.5, interval 2.5 ± 12.7 × 1.5: cut at a third of the range of the seeds
+    assert limits([1.0, 1.0], [4.0, 4.0]) == pytest.approx([1 - 3 / 3, 4 + 3 / 3])
+
+
 def test_the_mean_on_a_logarithmic_axis_is_geometric():
     curve = figures.Curve("TDC", "blue", np.array([10]), np.array([[1.0], [100.0]]))
     axes = draw(figures.draw_curves, [curve], "A", "variance", log=True)
