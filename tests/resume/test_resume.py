@@ -124,7 +124,7 @@ def test_starting_over_needs_consent(stopped, whole, capsys):
 
 def test_starting_over_removes_states_that_are_there(stopped, whole, capsys):
     assert resume(stopped, "--start-over") == 0
-    assert "Going on from" not in capsys.readouterr().out
+    assert "Continuing from" not in capsys.readouterr().out
     assert outcome(stopped) == whole
 
 

@@ -224,7 +224,7 @@ def _wait(process: subprocess.Popen, stack: Path, until_it_trains: bool) -> None
     log = stack.with_suffix(".log")
     while process.poll() is None and not stack.exists():
         time.sleep(0.005)
-    while until_it_trains and process.poll() is None and not re.search("Going on from|eval ", log.read_text()):
+    while until_it_trains and process.poll() is None and not re.search("Continuing from|eval ", log.read_text()):
         time.sleep(0.005)
 
 
