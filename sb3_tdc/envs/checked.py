@@ -256,9 +256,10 @@ class CheckedSubprocVecEnv(SubprocVecEnv):
                 remote.fail(info[_FAULT])
 
     def close(self) -> None:
-        """Close, also where processes have died."""
-        with suppress(EnvironmentFaultError):
-            return super().close()
+        """Close, also where processes have died: the answers of the others may never have been received."""
+        if not any(remote.is_dead for remote in self.remotes):
+            with suppress(EnvironmentFaultError):
+                return super().close()
         self._kill()
 
     def _kill(self) -> None:
@@ -278,18 +279,19 @@ class _Remote:
 
     def __init__(self, index: int, connection: Any, process: Any):
         self.index, self.connection, self.process = index, connection, process
+        self.is_dead = False
 
     def send(self, message: Any) -> None:
         try:
             self.connection.send(message)
         except ConnectionError as error:
-            raise EnvironmentFaultError(self.describe_death()) from error
+            raise self._death() from error
 
     def recv(self) -> Any:
         try:
             answer = self.connection.recv()
         except (EOFError, ConnectionError) as error:
-            raise EnvironmentFaultError(self.describe_death()) from error
+            raise self._death() from error
         if isinstance(answer, _Fault):
             self.fail(answer)
         return answer
@@ -299,6 +301,10 @@ class _Remote:
 
     def fail(self, fault: _Fault) -> NoReturn:
         raise EnvironmentFaultError(f"{fault.sentence}, in process {self.index}", fault.details)
+
+    def _death(self) -> EnvironmentFaultError:
+        self.is_dead = True
+        return EnvironmentFaultError(self.describe_death())
 
     def describe_death(self) -> str:
         """Return how the process ended."""

@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import sys
+import threading
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -222,3 +224,20 @@ def test_a_process_that_ends_is_named_with_how(processes, end, sentence):
         env.env_method("compute", 1)  # whatever is asked next
     with pytest.raises(EnvironmentFaultError, match=f"the process of environment 1 {sentence}"):
         processes(end, "forkserver")
+
+
+@pytest.mark.parametrize("dying", [0, 2])
+def test_environments_are_closed_after_the_death_of_any_process(dying):
+    """The answers of the others to the same step may not have been received."""
+    multiprocessing.set_forkserver_preload(["sb3_tdc.envs.checked"])
+    ends = [lambda: GOOD] * 3
+    ends[dying] = lambda: os.kill(os.getpid(), 9)
+    env = CheckedSubprocVecEnv([partial(CheckedEnv, Answers(end)) for end in ends], "forkserver")
+    env.reset()
+    with pytest.raises(EnvironmentFaultError, match=f"the process of environment {dying} was ended by SIGKILL"):
+        env.step(np.zeros((3, 1)))
+    closing = threading.Thread(target=env.close, daemon=True)
+    closing.start()
+    closing.join(30)
+    assert not closing.is_alive()
+    assert not any(process.is_alive() for process in env.processes)
