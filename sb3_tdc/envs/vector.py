@@ -45,7 +45,6 @@ class GymnasiumVecEnv(VecEnv):
             # Its processes would reset once more in the next step (Gymnasium 1.4)
             raise ValueError(f"{env} without shared memory resets twice: {_REMEDY}")
         self._actions: np.ndarray | None = None
-        self._last: Any = None
         self._can_reset_some: bool | None = None  # not known yet
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -58,8 +57,7 @@ class GymnasiumVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = split_infos(infos, self.num_envs)
-        self._last = to_numpy(observations)
-        return self._last
+        return copy_of(to_numpy(observations))  # the next step may write into the same memory
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -74,8 +72,7 @@ class GymnasiumVecEnv(VecEnv):
             observations, infos = self._end_episodes(observations, infos, dones)
             for i in map(int, np.flatnonzero(dones)):
                 infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
-        self._last = observations
-        return observations, rewards.astype(np.float32), dones, infos
+        return copy_of(observations), rewards.astype(np.float32), dones, infos
 
     def _end_episodes(
         self, observations: Any, infos: list[dict[str, Any]], dones: np.ndarray

@@ -119,9 +119,13 @@ def test_processes_that_would_reset_twice_are_refused():
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_no_transition_crosses_episodes(mode):
-    """A step that only resets would be one with reward 0 from the last observation to the first."""
-    env = VecMonitor(GymnasiumVecEnv(SyncVectorEnv([lambda: Counts([3])] * 2, autoreset_mode=mode)))
+@pytest.mark.parametrize("copy", [True, False])
+def test_no_transition_crosses_episodes(mode, copy):
+    """
+    A step that only resets would be one with reward 0 from the last observation to the first, and what is stored after
+    the next step must not be what that step has written into the same memory.
+    """
+    env = VecMonitor(GymnasiumVecEnv(SyncVectorEnv([lambda: Counts([3])] * 2, copy=copy, autoreset_mode=mode)))
     model = TDC("MultiInputPolicy", env, learning_starts=1000, buffer_size=200, seed=0, device="cpu").learn(60)
     buffer = model.replay_buffer
     now, then = buffer.observations, buffer.next_observations
@@ -145,14 +149,15 @@ class Tensors(VectorEnv):
 
     def reset(self, *, seed=None, options=None):
         self.t = th.arange(self.num_envs)
+        self.observations = th.empty(self.num_envs, 2)
         return self._observe(), {}
 
     def _observe(self):
-        return th.stack([self.t, self.t], dim=1).float()
+        return self.observations.copy_(th.stack([self.t, self.t], dim=1))  # in place, as simulators do
 
     def step(self, actions):
         self.t = self.t + 1
-        over, last = self.t >= 6, self._observe()
+        over, last = self.t >= 6, self._observe().clone()
         self.t = th.where(over, 0, self.t)
         infos = {"final_obs": last, "_final_obs": over} if over.any() else {}
         return self._observe(), th.ones(self.num_envs), th.zeros(self.num_envs, dtype=th.bool), over, infos
@@ -275,7 +280,9 @@ def test_tensors_become_arrays():
     assert infos[3]["terminal_observation"].tolist() == [6, 6]
     assert infos[3]["TimeLimit.truncated"] is True
     assert infos[0] == {}
-    TDC("MlpPolicy", env, learning_starts=20, batch_size=8, device="cpu").learn(60)
+    buffer = TDC("MlpPolicy", env, learning_starts=20, batch_size=8, device="cpu").learn(60).replay_buffer
+    filled = slice(0, buffer.pos)
+    np.testing.assert_array_equal(buffer.observations[filled] + 1, buffer.next_observations[filled])
 
 
 def test_attributes_and_methods():
