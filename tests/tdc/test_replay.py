@@ -1,6 +1,8 @@
 """The packed rows of the fused update against SB3's replay buffer, bit for bit."""
 
+import gc
 import pickle
+import weakref
 
 import gymnasium as gym
 import numpy as np
@@ -33,9 +35,9 @@ def make_buffer(n_envs=1, **kwargs):
     return ReplayBuffer(10 * n_envs, space, env.action_space, "cpu", n_envs=n_envs, **kwargs)
 
 
-def draw(packed_replay, batch_size, steps):
+def draw(packed_replay, buffer, batch_size, steps):
     """As SB3 would return it."""
-    rows = packed_replay.rows[packed_replay.draw(batch_size, steps)]
+    rows = packed_replay.rows[packed_replay.draw(buffer, batch_size, steps)]
     observations, actions, next_observations, rewards, dones, timeouts = rows.split([3, 2, 3, 1, 1, 1], dim=1)
     return ReplayBufferSamples(observations, actions, next_observations, dones * (1 - timeouts), rewards)
 
@@ -57,7 +59,7 @@ def test_returns_what_the_buffer_returns(n_envs, mirrored, kwargs):
         np.random.seed(added)
         expected = plain.sample(20)
         np.random.seed(added)
-        samples = draw(packed_replay, 20, steps)
+        samples = draw(packed_replay, packed, 20, steps)
         for name, got, want in zip(expected._fields, samples, expected, strict=True):
             assert got is want is None or th.equal(got, want.float()), (added, name)
         np.random.seed(added)  # the buffer itself goes on working
@@ -72,7 +74,7 @@ def test_the_arrays_of_the_buffer_are_the_rows():
     packed_replay = PackedReplay(buffer)
     buffer.rewards[:] = 7
     buffer.dones[:], buffer.timeouts[:] = 1, 0
-    samples = draw(packed_replay, 20, 5)
+    samples = draw(packed_replay, buffer, 20, 5)
     assert (samples.rewards == 7).all()
     assert (samples.dones == 1).all()
     copy = pickle.loads(pickle.dumps(buffer))
@@ -80,10 +82,18 @@ def test_the_arrays_of_the_buffer_are_the_rows():
     assert len(pickle.dumps(buffer)) < 2000 + packed_replay.slots.nbytes
     assert packed_replay.holds(buffer)
     assert not packed_replay.holds(copy)
-    both = pickle.loads(pickle.dumps(packed_replay))  # of which the buffer's arrays are not views any more
-    assert not both.holds(both.buffer)
     buffer.rewards = buffer.rewards.copy()
     assert not packed_replay.holds(buffer)
+
+
+def test_buffers_and_models_are_freed():
+    """Their memory is most of what a process has, and many are made in one: of seeds, of trials, in notebooks."""
+    model = make(TwoActions(), fused=True, buffer_size=60).learn(150)
+    assert model._fused_update.packed_replay is not None
+    left = [weakref.ref(part) for part in (model, model.replay_buffer, model._fused_update.packed_replay)]
+    del model
+    gc.collect()
+    assert [part() for part in left] == [None] * 3
 
 
 @HEADS

@@ -1,6 +1,6 @@
 """A replay buffer whose transitions lie in one place each."""
 
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import torch as th
@@ -25,28 +25,20 @@ class PackedReplay:
     On CUDA the rows are copied to the device; those that the buffer has got since, when a minibatch is drawn. There,
     what is changed in the buffer afterwards is not seen.
 
-    :param buffer: for which :meth:`applies`
+    :param buffer: for which :meth:`applies`; it is not kept alive
     """
 
     def __init__(self, buffer: ReplayBuffer):
-        self.buffer = buffer
+        self.buffer_ref = ref(buffer)
         widths = row_widths(buffer.observations.shape[-1], buffer.action_dim)
         self.slots = np.zeros((buffer.buffer_size, buffer.n_envs, sum(widths)), dtype=np.float32)
         columns = np.split(self.slots, np.cumsum(widths)[:-1], axis=-1)
         for name, part in zip(_ARRAYS, columns, strict=True):
-            self._move(name, part)
+            _move(buffer, name, part)
         self.host_rows = th.from_numpy(self.slots.reshape(-1, sum(widths)))
         self.rows = self.host_rows.to(buffer.device)
         self.pos = 0
         self.steps: int | None = None  # when the rows were copied last
-
-    def _move(self, name: str, part: np.ndarray) -> None:
-        """Let an array of the buffer be this part of the rows."""
-        array = getattr(self.buffer, name)
-        part = part if array.ndim == part.ndim else part[..., 0]
-        filled = slice(0, self.buffer.size())
-        part[filled] = array[filled]
-        setattr(self.buffer, name, part)
 
     @classmethod
     def of(cls, buffer: ReplayBuffer) -> "PackedReplay | None":
@@ -76,42 +68,51 @@ class PackedReplay:
     def holds(self, buffer: ReplayBuffer) -> bool:
         """Return whether this is the buffer, SB3 still samples it, and its arrays are still parts of the rows."""
         return (
-            self.buffer is buffer
+            self.buffer_ref() is buffer
             and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)
             and _samples_plainly(buffer)
         )
 
-    def draw(self, n: int, steps: int) -> np.ndarray:
+    def draw(self, buffer: ReplayBuffer, n: int, steps: int) -> np.ndarray:
         """
         Draw the rows of the minibatch that ``buffer.sample`` would draw, from the same random numbers.
 
+        :param buffer: which these rows hold
         :param n: how many
         :param steps: count of steps of the environments, one for all of them
         :return: (n,), indices of ``rows``
         """
-        buffer = self.buffer
         if self.rows is not self.host_rows:
-            self._copy_new_rows(steps)
+            self._copy_new_rows(buffer, steps)
         indices = np.random.randint(0, buffer.size(), size=n)
         if buffer.n_envs > 1:  # of one, SB3 draws nothing
             indices = indices * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=(n,))
         return indices
 
-    def _copy_new_rows(self, steps: int) -> None:
+    def _copy_new_rows(self, buffer: ReplayBuffer, steps: int) -> None:
         """To the device."""
-        buffer, size = self.buffer, self.buffer.buffer_size
+        size = buffer.buffer_size
         if self.steps is None or steps - self.steps != (buffer.pos - self.pos) % size:  # or more than it holds
-            self._copy_rows(0, buffer.size())
+            self._copy_rows(0, buffer.size(), buffer.n_envs)
         elif buffer.pos < self.pos:
-            self._copy_rows(self.pos, size)
-            self._copy_rows(0, buffer.pos)
+            self._copy_rows(self.pos, size, buffer.n_envs)
+            self._copy_rows(0, buffer.pos, buffer.n_envs)
         else:
-            self._copy_rows(self.pos, buffer.pos)
+            self._copy_rows(self.pos, buffer.pos, buffer.n_envs)
         self.pos, self.steps = buffer.pos, steps
 
-    def _copy_rows(self, start: int, stop: int) -> None:
-        rows = slice(start * self.buffer.n_envs, stop * self.buffer.n_envs)
+    def _copy_rows(self, start: int, stop: int, n_envs: int) -> None:
+        rows = slice(start * n_envs, stop * n_envs)
         self.rows[rows] = self.host_rows[rows].to(self.rows.device)
+
+
+def _move(buffer: ReplayBuffer, name: str, part: np.ndarray) -> None:
+    """Let an array of the buffer be this part of the rows."""
+    array = getattr(buffer, name)
+    part = part if array.ndim == part.ndim else part[..., 0]
+    filled = slice(0, buffer.size())
+    part[filled] = array[filled]
+    setattr(buffer, name, part)
 
 
 # Weak keys: a buffer's rows end with it

@@ -145,7 +145,7 @@ class FusedUpdate:
         model, packed = self.model, self._find_packed_replay()
         if packed is None:
             return model.replay_buffer.sample(self.batch_size, env=model._vec_normalize_env)
-        self.gather(packed.draw(self.batch_size, model.num_timesteps // model.n_envs))
+        self.gather(packed.draw(model.replay_buffer, self.batch_size, model.num_timesteps // model.n_envs))
         return self.minibatch
 
     def _find_packed_replay(self) -> PackedReplay | None:
