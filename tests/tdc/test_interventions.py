@@ -152,6 +152,27 @@ def replace_forward(model):
     model.actor.forward = forward
 
 
+def replace_predict(model):
+    own = model.policy.predict
+
+    def predict(*args, **kwargs):
+        CALLS.append("predict")
+        actions, state = own(*args, **kwargs)
+        return actions * 0.5, state
+
+    model.policy.predict = predict
+
+
+def replace_the_policys_forward(model):
+    own = model.policy._predict
+
+    def _predict(*args, **kwargs):
+        CALLS.append("_predict")
+        return own(*args, **kwargs) * 0.5
+
+    model.policy._predict = _predict
+
+
 def replace_the_forward_of_a_layer(model):
     layer = model.critic.layers[0]
     own = layer.forward
@@ -190,6 +211,8 @@ CHANGES = [
     replace_a_method_of_the_model,
     replace_minimize,
     replace_forward,
+    replace_predict,
+    replace_the_policys_forward,
     replace_the_forward_of_a_layer,
     replace_the_data_of_a_parameter,
     freeze_a_layer,
@@ -204,6 +227,8 @@ CALLED = {
     replace_a_method_of_the_model: "update_actor",
     replace_minimize: "minimize",
     replace_forward: "forward",
+    replace_predict: "predict",
+    replace_the_policys_forward: "_predict",
     replace_the_forward_of_a_layer: "layer",
 }
 

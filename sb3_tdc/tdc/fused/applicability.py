@@ -62,6 +62,7 @@ def obstacles(model: Any) -> list[str]:
             found.append(f"model.{name} is not model.policy.{name}")
     if type(policy) is not TDCPolicy:
         found.append(f"{type(policy).__qualname__} is a custom class")
+    found += [f"{name} of the policy is replaced" for name in _replaced_methods(policy)]
     found += [text for name, network in networks.items() for text in _network_obstacles(name, network)]
     if not found:
         found += [text for name, network in targets.items() for text in _network_obstacles(name, network)]
@@ -85,14 +86,18 @@ def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
         yield f"the {name} is a custom class, {type(network).__qualname__}"
         return
     for module in network.modules():
-        shadowed = [key for key in vars(module) if callable(getattr(type(module), key, None))]
-        if shadowed:
-            yield f"{shadowed[0]} of a module of the {name} is replaced"
+        for method in _replaced_methods(module):
+            yield f"{method} of a module of the {name} is replaced"
     if type(network.features_extractor) is not FlattenExtractor:
         yield f"the {name}'s features extractor is {type(network.features_extractor).__name__}"
     if _stacks(network) is None:
         layers = [type(m).__name__ for m in network.modules() if not list(m.children())]
         yield f"the {name}'s layers are not linear ones with ReLU between them: {', '.join(layers)}"
+
+
+def _replaced_methods(module: nn.Module) -> list[str]:
+    """The methods of a class that are others on this instance."""
+    return [name for name in vars(module) if callable(getattr(type(module), name, None))]
 
 
 def _stacks(network: Any) -> list[Any] | None:

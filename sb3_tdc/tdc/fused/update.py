@@ -41,7 +41,7 @@ class FusedUpdate:
         self.critic_adam = AdamStep(model.critic, model.critic_target)
         self.actor_adam = AdamStep(model.actor, model.actor_target)
         self.snapshot = Snapshot(model)
-        self.actor, self.actor_snapshot = model.actor, ModuleSnapshot(model.actor.modules())
+        self.policy, self.actor_snapshot = model.policy, ModuleSnapshot([model.policy, *model.actor.modules()])
         self.run: Callable[[Callable[[], Any]], Any] = CudaGraphs() if model.device.type == "cuda" else _call
         self.packed_replay: PackedReplay | None = None
         self.bind = Passes(load_kernels() if model.device.type == "cpu" else None)
@@ -166,8 +166,7 @@ class FusedUpdate:
 
     def acts(self) -> bool:
         """Return whether :meth:`act` is what the policy does."""
-        model = self.model
-        return model.policy.actor is self.actor and self.actor_snapshot.is_current()
+        return self.model.policy is self.policy and self.actor_snapshot.is_current()
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
