@@ -15,11 +15,12 @@ from typing import Any
 
 import numba
 import numpy as np
-from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
+
+from sb3_tdc.tdc.fused.passes import LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOG_SQRT_2_PI = np.float32(0.5 * math.log(2 * math.pi))
-_TANH_EPSILON = np.float32(1e-6)  # in the density of the tanh-Gaussian, as in SB3
+_TANH_EPSILON = np.float32(TANH_EPSILON)
 _LOG_STD_MIN, _LOG_STD_MAX = np.float32(LOG_STD_MIN), np.float32(LOG_STD_MAX)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.sac import policies as sac_policies
 from torch import nn
 from torch.nn.modules.module import register_module_forward_hook
 from torch.optim.optimizer import register_optimizer_step_pre_hook
@@ -90,6 +91,12 @@ def optimize_in_another_order(model):
 def add_a_group(model):
     first, *others = model.critic.parameters()
     model.critic.optimizer = th.optim.Adam([{"params": [first], "lr": 1e-2}, {"params": others}], lr=1e-3)
+
+
+def replace_the_group_in_its_list(model):
+    groups = model.critic.optimizer.param_groups
+    parameters = groups.pop()["params"]
+    model.critic.optimizer.add_param_group({"params": parameters, "lr": 1e-3, "weight_decay": 0.1})
 
 
 def replace_the_optimizers_step(model):
@@ -203,6 +210,7 @@ CHANGES = [
     optimize_the_last_layer_only,
     optimize_in_another_order,
     add_a_group,
+    replace_the_group_in_its_list,
     replace_the_optimizers_step,
     hook_a_parameter,
     hook_after_accumulation,
@@ -527,3 +535,36 @@ def test_integer_observations_are_acted_on_as_predict_does():
     model = make(Integers(), fused=True, action_noise=None, learning_starts=10).learn(30)
     expected = model.predict(model._last_obs)[0]
     np.testing.assert_allclose(model._sample_action(0)[0], expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("before", [True, False], ids=["in mid-run", "before the first update"])
+@pytest.mark.parametrize("change", ["limit", "epsilon"])
+def test_numbers_of_sb3s_density_count_if_they_are_changed(change, before, monkeypatch):
+    finals = []
+    for fused in (None, False):
+        model = make_model(stochastic_actor=True, fused=fused)
+        if before:
+            train(model, 1)
+        with monkeypatch.context() as patch:
+            if change == "limit":
+                patch.setattr(sac_policies, "LOG_STD_MAX", -1.0)
+            else:
+                model.actor.action_dist.epsilon = model.actor_target.action_dist.epsilon = 0.5
+            train(model, 2)
+            assert model._fused_update is None
+        finals.append(states(model))
+    assert_close(*finals, rtol=1e-3, atol=1e-4)
+
+
+def test_another_default_precision_of_pytorch_changes_nothing():
+    finals = []
+    for default in (th.float32, th.float64):
+        model = make_model()
+        th.set_default_dtype(default)
+        try:
+            train(model, 1)
+        finally:
+            th.set_default_dtype(th.float32)
+        assert model._fused_update is not None
+        finals.append(states(model))
+    assert_close(*finals, rtol=1e-6, atol=1e-7)

@@ -23,9 +23,8 @@ class AdamStep:
         self.parameters: list[nn.Parameter] = list(self.group["params"])
         self.values, self.targets = ([p.detach() for p in n.parameters()] for n in (network, target))
         self.gradients = [th.zeros_like(value) for value in self.values]
-        device = self.values[0].device
-        self.steps = th.zeros(len(self.values), device=device)
-        self.learning_rate = Scalar(th.empty((), device=device))  # a tensor, so that a CUDA graph reads it
+        self.steps = self.values[0].new_zeros(len(self.values))
+        self.learning_rate = Scalar(self.values[0].new_empty(()))  # a tensor, so that a CUDA graph reads it
         states = [network.optimizer.state[parameter] for parameter in self.parameters]
         for state, value, step in zip(states, self.values, self.steps, strict=True):
             if state:

@@ -6,12 +6,14 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.sac.policies import Actor as TanhGaussianActor
 from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import nn
 from torch.nn.modules import module as global_hooks
 from torch.optim import optimizer as global_optimizer_hooks
 
+from sb3_tdc.tdc.fused.passes import LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
 from sb3_tdc.tdc.policies import QuantileCritic, StackedLinear, TanhGaussian, TDCPolicy
 
 th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
@@ -88,11 +90,20 @@ def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
     for module in network.modules():
         for method in _replaced_methods(module):
             yield f"{method} of a module of the {name} is replaced"
+    if isinstance(network, TanhGaussianActor):
+        constants = constants_of(network.action_dist)
+        if constants != (LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON):
+            yield f"the limits of log σ, or the ε of its density, are not those of SB3: {constants}"
     if type(network.features_extractor) is not FlattenExtractor:
         yield f"the {name}'s features extractor is {type(network.features_extractor).__name__}"
     if _stacks(network) is None:
         layers = [type(m).__name__ for m in network.modules() if not list(m.children())]
         yield f"the {name}'s layers are not linear ones with ReLU between them: {', '.join(layers)}"
+
+
+def constants_of(distribution: Any) -> tuple[float, ...]:
+    """Return SB3's numbers in the density of its tanh-Gaussian, of the module and of the object."""
+    return sac_policies.LOG_STD_MIN, sac_policies.LOG_STD_MAX, distribution.epsilon
 
 
 def _replaced_methods(module: nn.Module) -> list[str]:

@@ -12,12 +12,12 @@ from types import ModuleType
 from typing import Any
 
 import torch as th
-from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
 from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 
 _LOG_SQRT_2_PI = 0.5 * math.log(2 * math.pi)
-_TANH_EPSILON = 1e-6  # in the density of the tanh-Gaussian, as in SB3
+# SB3's limits of log σ, and what its density of the tanh-Gaussian adds to 1 − a². Compiled code keeps them
+LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON = -20.0, 2.0, 1e-6
 
 _threshold_backward = th.ops.aten.threshold_backward.grad_input
 _tanh_backward = th.ops.aten.tanh_backward.grad_input
@@ -113,7 +113,7 @@ def sample_actions(
 
 def log_density(sample: th.Tensor, raw_log_std: th.Tensor, noise: th.Tensor, log_prob: th.Tensor) -> None:
     density = noise.square().mul_(-0.5).sub_(raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)).sub_(_LOG_SQRT_2_PI)
-    th.sum(density.sub_((1 - sample.square()).add_(_TANH_EPSILON).log_()), dim=1, out=log_prob)
+    th.sum(density.sub_((1 - sample.square()).add_(TANH_EPSILON).log_()), dim=1, out=log_prob)
 
 
 def tanh_gaussian_backward(
@@ -127,7 +127,7 @@ def tanh_gaussian_backward(
     log_std_bias_gradient: th.Tensor,
 ) -> None:
     coefficient, squeeze = ent_coef / len(slope), 1 - sample.square()
-    slope.add_((2 * coefficient) * sample / (squeeze + _TANH_EPSILON)).mul_(squeeze)
+    slope.add_((2 * coefficient) * sample / (squeeze + TANH_EPSILON)).mul_(squeeze)
     th.sum(slope, dim=0, keepdim=True, out=mean_bias_gradient)
     th.mul(slope, spread, out=log_std_slope)
     log_std_slope.sub_(coefficient).mul_((raw_log_std >= LOG_STD_MIN) & (raw_log_std <= LOG_STD_MAX))

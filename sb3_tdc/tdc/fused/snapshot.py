@@ -17,7 +17,7 @@ from stable_baselines3.sac.policies import Actor as TanhGaussianActor
 from torch import nn
 from torch.utils.hooks import RemovableHandle
 
-from sb3_tdc.tdc.fused.applicability import REPLACED_METHODS
+from sb3_tdc.tdc.fused.applicability import REPLACED_METHODS, constants_of
 
 _options_of = operator.itemgetter(  # the learning rate may change
     *("params", "betas", "eps", "weight_decay", "amsgrad", "maximize", "differentiable", "capturable")
@@ -48,6 +48,7 @@ class ModuleSnapshot:
         self.n_hooks = RemovableHandle.next_id
         self.stochastic = [module for module in modules if isinstance(module, TanhGaussianActor)]
         self.distributions = [actor.action_dist for actor in self.stochastic]
+        self.constants = list(map(constants_of, self.distributions))
         self.attributes = [vars(part) for part in (*modules, *self.distributions)]
         self.n_attributes = list(map(len, self.attributes))
         self.contents = [d for module in modules for d in (module._modules, module._parameters) if d]
@@ -62,6 +63,7 @@ class ModuleSnapshot:
             RemovableHandle.next_id == self.n_hooks
             and list(map(len, self.attributes)) == self.n_attributes
             and [actor.action_dist for actor in self.stochastic] == self.distributions
+            and list(map(constants_of, self.distributions)) == self.constants
             and _equal(gc.get_referents(*self.contents), self.values)
             and list(map(th.Tensor.data_ptr, self.parameters)) == self.storage
         )
@@ -84,7 +86,8 @@ class Snapshot:
         for optimizer in optimizers:
             self.contents += [vars(optimizer), optimizer.state, *optimizer.state.values()]
         self.values = gc.get_referents(*self.contents)
-        self.groups = [optimizer.param_groups[0] for optimizer in optimizers]
+        self.group_lists = [optimizer.param_groups for optimizer in optimizers]
+        self.groups = [group for groups in self.group_lists for group in groups]
         self.options = [(list(params), *rest) for params, *rest in map(_options_of, self.groups)]
         self.learning = [parameter for params, *_ in self.options for parameter in params]
         parts = [*policy.modules(), *self.modules.distributions, *optimizers]
@@ -99,6 +102,7 @@ class Snapshot:
             _settings_of(self.model) == self.settings
             and self.modules.is_current()
             and _equal(gc.get_referents(*self.contents), self.values)
+            and [id(group) for groups in self.group_lists for group in groups] == list(map(id, self.groups))
             and _equal(list(map(_options_of, self.groups)), self.options)
             and all(map(_requires_grad, self.learning))
             and [methods_of(cls) for cls, methods_of in self.methods_of] == self.methods

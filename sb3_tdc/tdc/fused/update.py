@@ -51,7 +51,7 @@ class FusedUpdate:
 
     def _make_buffers(self, obs_dim: int, action_dim: int) -> None:
         def empty(*shape: int) -> th.Tensor:
-            return th.empty(shape, device=self.model.device)
+            return th.empty(shape, dtype=th.float32, device=self.model.device)
 
         batch_size = self.batch_size
         widths = row_widths(obs_dim, action_dim)
