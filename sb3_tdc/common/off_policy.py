@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import Schedule
@@ -91,8 +91,17 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     # ---------------------------------------------------------------- logging
 
     def _setup_model(self) -> None:
+        given, kwargs = self.replay_buffer_class, self.replay_buffer_kwargs
+        self.replay_buffer_kwargs = dict(kwargs)
         super()._setup_model()
+        # What SB3 chose, with n and γ, is not saved: a model may be loaded with others
+        self._chose_replay_buffer, self.replay_buffer_kwargs = given is None, kwargs
         self._diagnostics = Diagnostics()
+
+    def _pass_gamma_to_replay_buffer(self) -> None:
+        """Let a replay buffer of n-step returns discount by γ as it is now."""
+        if self._chose_replay_buffer and isinstance(self.replay_buffer, NStepReplayBuffer):
+            self.replay_buffer.gamma = self.gamma
 
     def diagnose(self, **values: th.Tensor | float) -> None:
         """Take scalars of this update into the means of the log; nothing waits for the device."""
@@ -174,4 +183,6 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_diagnostics", "_scheduled_learning_rate"]
+        chosen = ["replay_buffer_class"] if self._chose_replay_buffer else []
+        own = ["_diagnostics", "_scheduled_learning_rate", "_chose_replay_buffer"]
+        return [*super()._excluded_save_params(), *own, *chosen]

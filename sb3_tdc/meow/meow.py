@@ -167,6 +167,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         :raises NonFiniteError: if the loss has been seen to be NaN or infinite
         """
         ent_coef = check_within(self.limits, "ent_coef", self.ent_coef)
+        self._pass_gamma_to_replay_buffer()
         self.policy.set_training_mode(True)
         update_learning_rate(self.policy.optimizer, self.scheduled("learning_rate"))
         statistics, target_statistics = (

@@ -89,10 +89,10 @@ OFF_POLICY = {
         action_noise=or_none(_noise),
         use_sde=boolean,
         optimize_memory_usage=boolean,
-        replay_buffer_class=or_none(_subclass(ReplayBuffer)),
         replay_buffer_kwargs=_arguments,
     ),
     **_optional(
+        replay_buffer_class=or_none(_subclass(ReplayBuffer)),
         policy_kwargs=_arguments,
         observation_space=_instance(spaces.Space),
         action_space=_instance(spaces.Box),

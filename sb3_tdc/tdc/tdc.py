@@ -327,6 +327,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         :raises NonFiniteError: if a loss has been seen to be NaN or infinite
         """
         lam = self.scheduled("lam")
+        self._pass_gamma_to_replay_buffer()
         self._renew_temperature()
         self._update_learning_rates()
         fused_update = self._bind_fused_update(batch_size)

@@ -14,6 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common import base_class
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -24,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from sb3_tdc import TDC, NonFiniteError, load_safely
+from sb3_tdc import MEOW, TDC, NonFiniteError, load_safely
 from sb3_tdc.common.checks import find_non_finite
 from sb3_tdc.safe_load import UnsafeFileError
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
@@ -438,6 +439,39 @@ def test_another_temperature_than_the_files(tmp_path, saved, new, expected, read
     loaded.learn(30)
     loaded.save(tmp_path / "again")
     assert read(tmp_path / "again").ent_coef == new
+
+
+@pytest.mark.parametrize("read", [lambda algorithm: algorithm.load, lambda algorithm: load_safely], ids=["load", "safe"])
+@pytest.mark.parametrize("algorithm", [TDC, MEOW])
+@pytest.mark.parametrize(("saved", "new"), [(3, {"gamma": 0.5}), (3, {"n_steps": 1}), (1, {"n_steps": 3}), (3, {})])
+def test_a_loaded_model_takes_the_n_step_returns_that_it_is_given(tmp_path, saved, new, algorithm, read, recwarn):
+    """SB3 saves the replay buffer that it chose, with its n and γ, and would load those again."""
+    size = {"buffer_size": 100, "learning_starts": 10, "batch_size": 4, "device": "cpu"}
+    user_kwargs = {"handle_timeout_termination": False}
+    first = algorithm("MlpPolicy", TwoActions(), n_steps=saved, replay_buffer_kwargs=user_kwargs, **size).learn(12)
+    first.save(tmp_path / "model")
+    model = read(algorithm)(tmp_path / "model", env=TwoActions(), **new)
+    n_steps, gamma = new.get("n_steps", saved), new.get("gamma", 0.99)
+    assert type(model.replay_buffer) is (NStepReplayBuffer if n_steps > 1 else ReplayBuffer)
+    assert not model.replay_buffer.handle_timeout_termination
+    assert user_kwargs == {"handle_timeout_termination": False}
+    model.learn(40)
+    assert not [warned for warned in recwarn if "n_steps" in str(warned.message)]
+    if n_steps > 1:
+        assert model.replay_buffer.n_steps == n_steps
+        assert model.replay_buffer.sample(100).discounts.min().item() == pytest.approx(gamma**n_steps)
+        model.gamma = 0.25
+        model.learn(5, reset_num_timesteps=False)
+        assert model.replay_buffer.sample(100).discounts.min().item() == pytest.approx(0.25**n_steps)
+
+
+@pytest.mark.parametrize("read", [TDC.load, load_safely])
+def test_a_replay_buffer_that_the_user_chose_is_loaded_as_it_was(tmp_path, read):
+    chosen = {"replay_buffer_class": NStepReplayBuffer, "replay_buffer_kwargs": {"n_steps": 2, "gamma": 0.7}}
+    make(**chosen).save(tmp_path / "model")
+    model = read(tmp_path / "model", env=TwoActions(), gamma=0.9)
+    model.learn(40)
+    assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (2, 0.7)
 
 
 def test_a_bad_temperature_is_refused_when_a_model_is_loaded(tmp_path):
