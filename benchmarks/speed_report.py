@@ -95,7 +95,7 @@ def write_report(results: dict[str, Any], folder: Path, targets: dict[tuple[str,
         f" update, deterministic head), where no other is named; median (quartiles) of"
         f" {results['rounds']} turns of {results['seconds']} s, taken in turn in one process, in another order each"
         " time, a few steps after each change. *2t*, *1t*: on two"
-        " threads, on one thread of one core. *target*: the aim set"
+        " threads, on one thread of one core. *target*: set"
         " beforehand, for HalfCheetah-v4.",
         "",
     ]

@@ -86,7 +86,7 @@ class AdvBTDC(Advised, TDC):
     """
     TDC with the board of AdvB-TD3: members' mean actions, scored by min_i (μ_i − λσ_i) of TDC's critics.
 
-    Its policy is not TDC's own, so that the readable update applies.
+    Its policy is a subclass of TDC's, so only the readable update is used.
 
     :param args: those of TDC
     :param kwargs: those of TDC; ``formation_period``: episodes before the board also acts in training

@@ -49,7 +49,12 @@ def make_parser() -> Parser:
     add("--logs", type=Path, default=Path("logs"), help="folder of all searches")
     add("--jobs", type=int, help="CPUs to use (default: all cores); a trial takes one, with --asha one a seed")
     add("--address", help="of a Ray cluster that shares this file system (default: this machine)")
-    add("--resume", type=Path, metavar="FOLDER", help="continue a stopped search; it has all other arguments")
+    add(
+        "--resume",
+        type=Path,
+        metavar="FOLDER",
+        help="continue a stopped search; its folder holds the other arguments",
+    )
     return parser
 
 

@@ -34,7 +34,7 @@ _OLDER = 10
 
 class ResumeStates(BaseCallback):
     """
-    States from which a run continues as if it had never been stopped. The first of the callbacks::
+    Write states from which a run continues as if it had never been stopped. Must be the first callback::
 
         states = ResumeStates("my_run/resume")
         states.select(model)  # nothing happens if there are none yet
@@ -44,11 +44,11 @@ class ResumeStates(BaseCallback):
     at no other moment do the objects hold the whole state.
 
     :param folder: of the states; of one run
-    :param freq: environment steps between states, at least
-    :param keep: how many of the newest stay on disk; besides, an older one stays, to go back to before a divergence,
-        and the one that will take its place
+    :param freq: minimum number of environment steps between regular states
+    :param keep: how many of the newest stay on disk. One older state also stays, for going back before a divergence,
+        and the one that will replace it
     :param files: files that callbacks rewrite and that belong to the state; those of an ``EvalCallback`` do
-    :param hyperparams: plain values that the run was made from: one that is another when the run is resumed is refused
+    :param hyperparams: plain values that the run was built from; a resumed run with another value is refused
     :param verbose: 0: no messages but warnings
     :raises ValueError: if ``freq`` or ``keep`` is below 1, or another process writes to the folder
     """
@@ -94,7 +94,7 @@ class ResumeStates(BaseCallback):
 
         :param model: built as for the first run, with its environments
         :param step: go back to the state of this step; those after it are removed when training begins
-        :param changed: attributes of the model that stay as it was built, out of those of ``run_state.changeable``
+        :param changed: hyperparameters that keep the model's new value, not the state's, for instance ``learning_rate``
         :return: the timestep it will continue from, None if there is no state yet
         :raises ValueError: if it is of another algorithm or environment, if there are some and none is intact, or if
             there is none of that step

@@ -61,7 +61,7 @@ def setting(  # type: ignore[no-untyped-def]
 class RunSettings:
     """Every setting with its flag, its default and what depends on it."""
 
-    algo: str = setting(default="tdc", help="algorithm", known=("algorithm", ALGORITHMS))
+    algo: str = setting(default="tdc", help="algorithm: " + ", ".join(ALGORITHMS), known=("algorithm", ALGORITHMS))
     env: str = setting(default="HalfCheetah-v4", help="environment id")
     n_timesteps: int = setting(
         *("-n", "--n-timesteps"),
@@ -94,7 +94,11 @@ class RunSettings:
         default=None, help="entry of that file instead of the environment's (parallel: for thousands of environments)"
     )
     trained_agent: Path | None = setting(
-        "-i", "--trained-agent", default=None, role=Role.EXPERIMENT, help="zip of a model to continue from"
+        "-i",
+        "--trained-agent",
+        default=None,
+        role=Role.EXPERIMENT,
+        help="zip of a model to train further, in a new run",
     )
     trust: bool = setting(default=False, help="let the files of -i run code, as SB3 does")
     eval_freq: int = setting(
@@ -114,13 +118,13 @@ class RunSettings:
         default=None,
         minimum=1,
         minus_one="none",
-        help=f"environment steps between resume states, by default {DEFAULT_FREQ:,}, or 100 an environment",
+        help=f"environment steps between resume states (default: {DEFAULT_FREQ:,}, or 100 per environment if that is more)",
     )
     resume: Path | None = setting(
         default=None,
         role=Role.RESUMING,
         metavar="RUN_FOLDER",
-        help="continue a stopped run; it has all other arguments",
+        help="continue a stopped run from its folder; the other arguments are taken from there",
     )
     from_step: int | None = setting(
         "--from",
@@ -136,7 +140,12 @@ class RunSettings:
     tensorboard_log: str | None = setting(
         "-tb", "--tensorboard-log", default=None, help='TensorBoard folder (none given: the run\'s own; "": off)'
     )
-    log_interval: int = setting(default=-1, minimum=0, minus_one="4", help="episodes between log entries, 0 for no log")
+    log_interval: int = setting(
+        default=-1,
+        minimum=0,
+        minus_one="4, or the number of environments if that is larger",
+        help="episodes between log entries, 0 for no log",
+    )
     uuid: bool = setting("-uuid", "--uuid", default=False, help="a unique name for the run folder")
     num_threads: int = setting(
         default=-1, minimum=1, minus_one="at most two", role=Role.PROCESS, help="threads for PyTorch"

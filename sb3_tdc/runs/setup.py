@@ -114,7 +114,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     if folder.is_finished and not settings.start_over:
         return None
     if not settings.writes_states:
-        raise ValueError(f"{folder.path} has no resume states: it was made without --resume-freq")
+        raise ValueError(f"{folder.path} has no resume states: it was trained with --resume-freq -1")
     has_state = bool(stored_steps(folder.resume_folder)) and not settings.start_over
     if folder.has_results and not has_state and not settings.start_over:
         raise ValueError(

@@ -45,8 +45,9 @@ def load_safely(
     :param path: zip of a saved model, with or without its suffix
     :param env: the environment to run it on; None to only predict
     :param device: PyTorch device
-    :param custom_objects: what to take for fields of the file, by name, which are then not looked at
-    :param algorithm: the class to make; None: by the file's policy (for DDPG, which has TD3's policies, TD3)
+    :param custom_objects: values by field name that replace those of the file, which are then not read
+    :param algorithm: the class of the returned model; None for the one that the file's policy belongs to (of DDPG,
+        which has the same policies, TD3). Required for a variant of TDC
     :param kwargs: attributes to set over the file's, for instance ``buffer_size=1``
     :raises UnsafeFileError: (a ``ValueError``) if the file is refused or damaged, in one sentence that names the field
     :raises ValueError: if it is of another algorithm, or of an environment with other spaces

@@ -91,8 +91,9 @@ class TDC(CheckedOffPolicyAlgorithm):
     :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` from 0.1 on,
         a number fixes it
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
-    :param fused: the same update on preallocated buffers, faster: None where it applies (plain ReLU networks, flat
-        observations, Adam, on the CPU), True to demand it (also on CUDA, there with graphs), False for none
+    :param fused: whether to use the fused update (the same update on preallocated buffers, faster). None: where it
+        applies (plain ReLU networks, flat observations, Adam, on the CPU). True: required, also on CUDA, where it uses
+        CUDA graphs. False: never
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),

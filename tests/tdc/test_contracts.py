@@ -441,7 +441,9 @@ def test_another_temperature_than_the_files(tmp_path, saved, new, expected, read
     assert read(tmp_path / "again").ent_coef == new
 
 
-@pytest.mark.parametrize("read", [lambda algorithm: algorithm.load, lambda algorithm: load_safely], ids=["load", "safe"])
+@pytest.mark.parametrize(
+    "read", [lambda algorithm: algorithm.load, lambda algorithm: load_safely], ids=["load", "safe"]
+)
 @pytest.mark.parametrize("algorithm", [TDC, MEOW])
 @pytest.mark.parametrize(("saved", "new"), [(3, {"gamma": 0.5}), (3, {"n_steps": 1}), (1, {"n_steps": 3}), (3, {})])
 def test_a_loaded_model_takes_the_n_step_returns_that_it_is_given(tmp_path, saved, new, algorithm, read, recwarn):
