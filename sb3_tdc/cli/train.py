@@ -90,6 +90,9 @@ def _main(argv: Sequence[str] | None) -> int:
     try:
         outcome = train(run)
     except (SetupError, NotRestoredError) as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            print(error, file=sys.stderr)
+            return 130
         parser.fail(error)
     except (TrainingError, NotSavedError, LockedError, NonFiniteError, KeyboardInterrupt) as error:
         return _report_failure(error, folder)

@@ -654,3 +654,13 @@ def test_help_shows_defaults_that_are_values_alone(make_parser):
     shown = {" ".join(default.split()) for default in re.findall(r"\(default:\s+(.*?)\)", text, re.DOTALL)}
     assert {"tdc", "logs", "HalfCheetah-v4"} <= shown
     assert not shown & {"None", "True", "False", "[]", "{}"}
+
+
+def test_a_ctrl_c_before_training_begins_ends_with_130_and_leaves_nothing(tmp_path, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    gym.register("Interrupted-v0", interrupted)
+    assert run_train(tmp_path, env="Interrupted-v0", n=100) == 130
+    assert "Interrupted before training began" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("args.yml"))
