@@ -98,7 +98,7 @@ class RunSettings:
         "--trained-agent",
         default=None,
         role=Role.EXPERIMENT,
-        help="zip of a model to train further, in a new run",
+        help="zip of a model to train further in a new run",
     )
     trust: bool = setting(default=False, help="let the files of -i run code, as SB3 does")
     eval_freq: int = setting(
@@ -118,13 +118,13 @@ class RunSettings:
         default=None,
         minimum=1,
         minus_one="none",
-        help=f"environment steps between resume states (default: {DEFAULT_FREQ:,}, or 100 per environment if that is more)",
+        help=f"environment steps between resume states, by default {DEFAULT_FREQ:,} or, if more, 100 an environment",
     )
     resume: Path | None = setting(
         default=None,
         role=Role.RESUMING,
         metavar="RUN_FOLDER",
-        help="continue a stopped run from its folder; the other arguments are taken from there",
+        help="continue a stopped run; its folder holds the other arguments",
     )
     from_step: int | None = setting(
         "--from",

@@ -17,7 +17,7 @@ from tests.helpers.training import fails
         ("--eval-freq", -2, "at least 0 (or -1: none, as 0)"),
         ("--save-freq", -5, "at least 0 (or -1: only at the end, as 0)"),
         ("--resume-freq", 0, "at least 1 (or -1: none)"),
-        ("--log-interval", -2, "at least 0 (or -1: 4)"),
+        ("--log-interval", -2, "at least 0 (or -1: 4, or the number of environments if that is larger)"),
         ("--num-threads", 0, "at least 1 (or -1: at most two)"),
         ("--n-eval-envs", -1, "at least 1"),
         ("--verbose", -1, "at least 0"),
