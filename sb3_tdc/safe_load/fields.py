@@ -18,8 +18,8 @@ from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.untrusted import shown
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
-from sb3_tdc.safe_load.inert_pickle import Name, Rebuild, names_in, read_pickle
-from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, pickled_name
+from sb3_tdc.safe_load.inert_pickle import Call, Name, Rebuild, code_in, read_pickle
+from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, TAKEN, pickled_name
 from sb3_tdc.safe_load.reading import reading
 from sb3_tdc.safe_load.sb3_fields import OF_SB3, OFF_POLICY
 
@@ -136,13 +136,13 @@ def _check_policy_arguments(arguments: dict[str, Any], policy_class: Any, declar
                 field.check(name, value)
 
 
-def _pickled(value: Any, budget: Budget) -> Any:
+def _pickled(value: Any, budget: Budget, noted: list[Name | Call] | None = None) -> Any:
     """Return what :func:`read_pickle` makes of a pickled field."""
     text = value[":serialized:"]
     if not isinstance(text, str):
         raise UnsafeFileError("its pickle is not a text")
     budget.take_bytes(len(text))
-    return read_pickle(base64.b64decode(text, validate=True), budget)
+    return read_pickle(base64.b64decode(text, validate=True), budget, noted)
 
 
 def foreign_names(value: Any, budget: Budget) -> list[str]:
@@ -154,9 +154,10 @@ def foreign_names(value: Any, budget: Budget) -> list[str]:
     """
     if not (isinstance(value, dict) and ":serialized:" in value):
         return []
-    policies = {pickled_name(policy) for policy in known_policies()}
-    known = {*CLASSES, *CALLS, *policies, *_HARMLESS}
-    return sorted(str(name) for name in names_in(_pickled(value, budget)) if name not in known)
+    noted: list[Name | Call] = []
+    _pickled(value, budget, noted)
+    names = {*CLASSES, *map(pickled_name, known_policies())}
+    return code_in(noted, names, {**dict.fromkeys(_HARMLESS, lambda _: True), **TAKEN})
 
 
 # What SB3 and numpy write into fields that are made anew, and into attributes that are not looked at

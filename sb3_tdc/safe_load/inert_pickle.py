@@ -7,7 +7,7 @@ Python's unpickler is not used.
 """
 
 import pickletools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import IO, Any, NamedTuple
 
@@ -59,24 +59,25 @@ _SCALARS = (str, bytes, int, float, bool, type(None))
 MAX_KEY = 2**32  # integers below it cannot be chosen so that their hashes collide
 
 
-def read_pickle(data: bytes | IO[bytes], budget: Budget) -> Any:
+def read_pickle(data: bytes | IO[bytes], budget: Budget, noted: list[Name | Call] | None = None) -> Any:
     """
     Read a pickle without importing or calling anything.
 
     :param data: a pickle of protocol 2 or later, or a file whose ``read(n)`` makes nothing larger than what is left
     :param budget: of the file that it is in
+    :param noted: gets every name and call, also those that the value does not hold in the end
     :return: numbers, texts, bytes, tuples, lists, dicts and sets of these; :class:`Name`; :class:`Call`
     :raises UnsafeFileError: if it is damaged, or is more than data, names and calls
     """
     try:
-        return _run(data, budget)
+        return _run(data, budget, [] if noted is None else noted)
     except UnsafeFileError:
         raise
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UnsafeFileError("a damaged pickle") from error
 
 
-def _run(data: bytes | IO[bytes], budget: Budget) -> Any:
+def _run(data: bytes | IO[bytes], budget: Budget, noted: list[Name | Call]) -> Any:
     """The pickle machine, in which importing and calling are only noted down."""
     stack: list[Any] = []
     marks: list[list[Any]] = []  # the stacks below each MARK
@@ -86,6 +87,10 @@ def _run(data: bytes | IO[bytes], budget: Budget) -> Any:
         nonlocal stack
         items, stack = stack, marks.pop()
         return items
+
+    def push_noted(part: Name | Call) -> None:
+        noted.append(part)
+        stack.append(part)
 
     argument: Any
     for opcode, argument, _ in pickletools.genops(data):
@@ -132,20 +137,22 @@ def _run(data: bytes | IO[bytes], budget: Budget) -> Any:
                 raise UnsafeFileError("a set of more than small integers and texts")
             stack[-1].update(items) if name == "ADDITEMS" else stack.append(set(items))
         elif name == "GLOBAL":
-            stack.append(Name(*argument.split(" ", 1)))
+            push_noted(Name(*argument.split(" ", 1)))
         elif name == "STACK_GLOBAL":
             attribute, module = stack.pop(), stack.pop()
             if not (isinstance(module, str) and isinstance(attribute, str)):
                 raise UnsafeFileError("an import of something that is not a name")
-            stack.append(Name(module, attribute))
+            push_noted(Name(module, attribute))
         elif name in _CALLS:
             args, function = stack.pop(), stack.pop()
-            stack.append(Call(function, args))
+            push_noted(Call(function, args))
         elif name == "BINPERSID":
-            stack.append(Call(PERSISTENT, stack.pop()))
+            push_noted(Call(PERSISTENT, stack.pop()))
         elif name == "BUILD":
             state = stack.pop()
-            stack[-1].state = state  # of a Call; anything else has no such attribute
+            if stack[-1].state is not None:  # of a Call; anything else has no such attribute
+                raise UnsafeFileError("an object that is changed twice")
+            stack[-1].state = state
         elif name == "STOP":
             return stack.pop()
         elif name not in ("PROTO", "FRAME"):
@@ -248,35 +255,53 @@ class Handler:
     :param args: how many arguments, the fewest and the most
     :param state: whether it takes one
     :param items: whether it takes any
+    :param only: given so many arguments, whether it takes them
     """
 
     make: Callable[[Call, Rebuild], Any]
     args: tuple[int, int] = (0, 0)
     state: bool = False
     items: bool = False
+    only: Callable[..., bool] = lambda *_: True
 
     def __call__(self, call: Call, make: Rebuild) -> Any:
-        fewest, most = self.args
-        if not isinstance(call.args, tuple) or not fewest <= len(call.args) <= most:
+        if not self._takes_arguments(call):
             raise UnsafeFileError(f"a call of {call.function} with other arguments than it takes")
-        if (call.state is not None) > self.state or bool(call.items) > self.items:
+        if not self._takes_changes(call):
             raise UnsafeFileError(f"a {call.function} that is changed after it was made")
         return self.make(call, make)
 
+    def takes(self, call: Call) -> bool:
+        """Return whether a call, and what is done to its result, is all that the known one takes."""
+        return self._takes_arguments(call) and self._takes_changes(call)
 
-def names_in(value: Any) -> set[Name]:
-    """Return everything that a pickle would import, however it is nested."""
-    found: set[Name] = set()
-    seen: dict[int, Any] = {}
-    waiting = [value]
-    while waiting:
-        part = waiting.pop()
+    def _takes_arguments(self, call: Call) -> bool:
+        fewest, most = self.args
+        return isinstance(call.args, tuple) and fewest <= len(call.args) <= most and self.only(*call.args)
+
+    def _takes_changes(self, call: Call) -> bool:
+        return (call.state is not None) <= self.state and bool(call.items) <= self.items
+
+
+def code_in(
+    noted: Iterable[Name | Call], names: Container[Name], calls: Mapping[Name, Callable[[Call], bool]]
+) -> list[str]:
+    """
+    List what unpickling would import or call that is not known.
+
+    :param noted: by :func:`read_pickle`
+    :param names: what may be imported
+    :param calls: what may also be called, and whether it may be called so
+    :return: names, sorted
+    """
+    found = set()
+    for part in noted:
         if isinstance(part, Name):
-            found.add(part)
-        elif isinstance(part, (Call, dict, list, tuple)) and id(part) not in seen:
-            seen[id(part)] = part
-            if isinstance(part, Call):
-                waiting += [part.function, part.args, part.state, part.items]
-            else:
-                waiting += part.values() if isinstance(part, dict) else part
-    return found
+            is_known, name = part in names or part in calls, str(part)
+        elif isinstance(part.function, Name):
+            is_known, name = part.function in calls and calls[part.function](part), str(part.function)
+        else:
+            is_known, name = False, "what another call returns"
+        if not is_known:
+            found.add(name)
+    return sorted(found)

@@ -18,8 +18,8 @@ from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES, foreign_names, on_the_command_line, parse_data
-from sb3_tdc.safe_load.inert_pickle import Call, names_in, read_pickle
-from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, pickled_name
+from sb3_tdc.safe_load.inert_pickle import Call, Name, code_in, read_pickle
+from sb3_tdc.safe_load.known_objects import CLASSES, TAKEN, pickled_name
 from sb3_tdc.safe_load.models import load_safely, read_model_fields
 from sb3_tdc.safe_load.reading import reading
 from sb3_tdc.safe_load.regular_files import open_regular
@@ -100,10 +100,11 @@ def _list_code(code: dict[str, list[str]]) -> list[str]:
 def _describe_pickle(path: Path, size: int) -> tuple[list[str], bool]:
     with open_regular(path, MAX_REPLAY_BYTES) as (file, _):
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            value = read_pickle(content, Budget(size))  # type: ignore[arg-type]  # a mapped file reads like a file
+            noted: list[Name | Call] = []
+            value = read_pickle(content, Budget(size), noted)  # type: ignore[arg-type]  # it reads like a file
     kind = str(value.function) if isinstance(value, Call) else f"a {type(value).__name__}"
     is_known = isinstance(value, Call) and value.function in _PICKLED
-    foreign = sorted(str(name) for name in names_in(value) - {*CALLS, *CLASSES, *_PICKLED})
+    foreign = code_in(noted, CLASSES, {**dict.fromkeys(_PICKLED, lambda call: call.args == ()), **TAKEN})
     verdict = (
         "Would be read as data, if it fits the environment." if is_known else f"Refused: {kind} is not known here."
     )

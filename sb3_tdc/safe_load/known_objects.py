@@ -236,9 +236,11 @@ def _enum_of_value(call: Call, make: Rebuild) -> Enum:
 def _enum_of_name(call: Call, make: Rebuild) -> Enum:
     """``getattr(SomeEnum, "MEMBER")``, as the first versions of Python 3.11 pickle a member; of nothing but an enum."""
     cls, member = call.args
-    if not (isinstance(cls, Name) and cls in _ENUMS and isinstance(member, str) and member in _ENUMS[cls].__members__):
-        raise UnsafeFileError(f"a call of {call.function} of something that is no known enum")
     return _ENUMS[cls][member]
+
+
+def _is_member(cls: Any, member: Any) -> bool:
+    return isinstance(cls, Name) and cls in _ENUMS and isinstance(member, str) and member in _ENUMS[cls].__members__
 
 
 def _object(make: Callable[[Call, Rebuild], Any]) -> Handler:
@@ -283,5 +285,7 @@ CALLS: dict[Name, Handler] = {
     Name(f"{_SB3}.running_mean_std", "RunningMeanStd"): _object(_running_mean_std),
     Name(f"{_SB3}.type_aliases", "TrainFreq"): Handler(_train_freq, args=(2, 2)),
     **dict.fromkeys(_ENUMS, Handler(_enum_of_value, args=(1, 1))),
-    Name("builtins", "getattr"): Handler(_enum_of_name, args=(2, 2)),
+    Name("builtins", "getattr"): Handler(_enum_of_name, args=(2, 2), only=_is_member),
 }
+# Whether a call of a name is one that its entry takes
+TAKEN: dict[Name, Callable[[Call], bool]] = {name: handler.takes for name, handler in CALLS.items()}

@@ -10,6 +10,7 @@ import pickle
 import re
 import shutil
 import struct
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -34,10 +35,12 @@ from sb3_tdc.cli import enjoy, inspect
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer
 from sb3_tdc.safe_load.budget import Budget
-from sb3_tdc.safe_load.fields import saved_fields
+from sb3_tdc.safe_load.fields import foreign_names, saved_fields
 from sb3_tdc.safe_load.inert_pickle import read_pickle
+from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
+from tests.safe_load.attacks.tools import Op, pickled
 
 
 @pytest.fixture(scope="module")
@@ -731,11 +734,71 @@ def test_code_in_a_field_that_is_not_read_is_named(saved, tmp_path, marker):
     assert not marker.exists()
 
 
+def call(function, *args):
+    return function + Op.tuple_of(*args) + Op.REDUCE
+
+
+def attribute(of, name):
+    return call(Op.name("builtins", "getattr"), of, Op.text(name))
+
+
+_STEP = attribute(Op.name("stable_baselines3.common.type_aliases", "TrainFrequencyUnit"), "STEP")
+_RUNS = Op.name("builtins", "exec"), Op.text("import os, pathlib; pathlib.Path(os.environ['MARKER']).touch()")
+
+
+def code_of_known_names():
+    """``Box.sample.__globals__.get("__builtins__").get("exec")(…)``, of names that are all known."""
+    known = attribute(attribute(Op.name("gymnasium.spaces.box", "Box"), "sample"), "__globals__")
+    builtins = call(attribute(known, "get"), Op.text("__builtins__"))
+    return call(call(attribute(builtins, "get"), Op.text("exec")), _RUNS[1], Op.EMPTY_DICT)
+
+
+@pytest.mark.parametrize(
+    ("field", "found"),
+    [
+        (code_of_known_names(), ["builtins.getattr", "what another call returns"]),
+        (call(*_RUNS) + Op.POP + Op.NONE, ["builtins.exec"]),  # the value does not hold what was called
+        (
+            Op.EMPTY_DICT + Op.text("a") + call(*_RUNS) + Op.SETITEM + Op.text("a") + Op.NONE + Op.SETITEM,
+            ["builtins.exec"],
+        ),
+        (_STEP + Op.EMPTY_DICT + Op.BUILD, ["builtins.getattr"]),  # it would change the enum
+        (_STEP, []),
+    ],
+    ids=["known names", "dropped", "replaced", "an enum that is changed", "an enum"],
+)
+def test_code_in_a_field_is_found_by_how_names_are_called(saved, tmp_path, marker, field, found):
+    path = with_fields(saved, tmp_path / "x.zip", start_time=pickled(Op.PROTO + field + Op.STOP))
+    assert foreign_names(fields_of(path)["start_time"], Budget(10_000)) == found
+    assert names_code(path) == bool(found)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", RuntimeWarning)
+        load_safely(path, device="cpu")
+    assert any("'start_time' is not read here, but" in str(each.message) for each in told) == bool(found)
+    assert not marker.exists()
+    with contextlib.suppress(Exception):  # the control: SB3 runs it
+        TDC.load(path, device="cpu")
+    assert marker.exists() == any(name != "builtins.getattr" for name in found)
+
+
+def test_code_in_statistics_is_found_by_how_names_are_called(tmp_path, capsys):
+    (tmp_path / "stats.pkl").write_bytes(pickle.dumps(frames(), 2)[:-1] + code_of_known_names() + Op.POP + Op.STOP)
+    _, out = inspected(tmp_path / "stats.pkl", capsys)
+    assert re.search(r"not read here:\n(  .*\n)*  builtins\.getattr\n(  .*\n)*  what another call returns\n", out)
+
+
+def test_an_object_that_is_changed_twice_is_refused():
+    changed = Op.name("gymnasium.spaces.box", "Box") + Op.EMPTY_TUPLE + Op.REDUCE + Op.EMPTY_DICT + Op.BUILD
+    with pytest.raises(UnsafeFileError, match="changed twice"):
+        read_pickle(Op.PROTO + changed + Op.NONE + Op.BUILD + Op.STOP, Budget(10_000))
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("name", ["tdc", "td3-vectorized-noise", "sac", "ddpg"])
+@pytest.mark.parametrize("name", MODELS)
 def test_nothing_is_named_of_what_sb3_writes(tmp_path, name):
-    MODELS[name]().save(tmp_path / "model.zip")
-    load_safely(tmp_path / "model.zip", device="cpu")
+    model = MODELS[name]()
+    model.save(tmp_path / "model.zip")
+    load_safely(tmp_path / "model.zip", model.get_env() if "her" in name else None, device="cpu")
 
 
 def test_a_strategy_of_hindsight_as_an_enum(tmp_path):
