@@ -10,6 +10,7 @@ import pickle
 import re
 import shutil
 import struct
+import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
@@ -34,6 +35,7 @@ from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import enjoy, inspect
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization, load_replay_buffer
+from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import foreign_names, saved_fields
 from sb3_tdc.safe_load.inert_pickle import read_pickle
@@ -41,6 +43,7 @@ from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
 from tests.safe_load.attacks.tools import Op, pickled
+from tests.safe_load.attacks.zips import understated
 
 
 @pytest.fixture(scope="module")
@@ -430,7 +433,7 @@ def test_zip_bombs_are_refused_unread(saved, tmp_path, monkeypatch):
         raise AssertionError("it was read")
 
     with monkeypatch.context() as patch:
-        patch.setattr(zipfile.ZipFile, "read", forbidden)
+        patch.setattr(zipfile.ZipFile, "open", forbidden)
         assert "compressed more than 100-fold" in refuse(path)
     many = tmp_path / "many.zip"
     with zipfile.ZipFile(many, "w") as archive:
@@ -444,6 +447,24 @@ def test_zip_bombs_are_refused_unread(saved, tmp_path, monkeypatch):
     struct.pack_into("<LL", lie, entry + 20, 2**32 - 2, 2**32 - 2)
     path.write_bytes(lie)
     assert "far more memory than it has bytes" in refuse(path)
+
+
+def test_no_more_of_an_entry_is_decompressed_than_it_says(saved, tmp_path):
+    path = understated(tmp_path, saved, says=2**20, inflates_to=2**28)
+    tracemalloc.start()
+    with open(path, "rb") as file:
+        entries = read_archive(file, MODEL_ENTRIES, Budget(path.stat().st_size))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(entries["system_info.txt"]) == 2**20
+    assert peak < 2**24
+
+
+def test_reading_entries_takes_its_time_from_the_budget(saved):
+    budget = Budget(saved.stat().st_size)
+    budget.take_bytes = lambda _: setattr(budget, "deadline", 0.0)  # spent after the first look
+    with open(saved, "rb") as file, pytest.raises(UnsafeFileError, match="takes too long"):
+        read_archive(file, MODEL_ENTRIES, budget)
 
 
 def test_a_compressed_copy_opens(saved, tmp_path):

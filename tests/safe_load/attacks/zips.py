@@ -1,7 +1,9 @@
 """Zips that grow."""
 
 import io
+import struct
 import zipfile
+import zlib
 
 from tests.safe_load.attacks.tools import Op, rewrite
 
@@ -31,6 +33,22 @@ def many_layers(folder, model):
 
 def text(folder, model):
     return rewrite(model, folder / "x.zip", deflate=True, **{"system_info.txt": bytes(2**29)})
+
+
+def understated(folder, model, says=60 * 2**20, inflates_to=1000 * 2**20):
+    """An entry that inflates to more than it says, with the checksum of what it says."""
+    path = rewrite(model, folder / "x.zip", **{"system_info.txt": None})
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("system_info.txt", "w") as entry:
+        for _ in range(inflates_to // 2**20):
+            entry.write(bytes(2**20))
+    content = bytearray(path.read_bytes())
+    directory = content.rindex(b"PK\1\2")
+    (local,) = struct.unpack_from("<L", content, directory + 42)
+    for checksum, size in ((directory + 16, directory + 24), (local + 14, local + 22)):
+        struct.pack_into("<L", content, checksum, zlib.crc32(bytes(says)))
+        struct.pack_into("<L", content, size, says)
+    path.write_bytes(content)
+    return path
 
 
 ATTACKS = {"two layers": layers, "two layers, four times": many_layers, "half a GiB of zeros": text}
