@@ -4,8 +4,6 @@ import inspect
 import json
 import os
 import re
-import zipfile
-import zlib
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.envs.simulator import GYMNASIUM
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
+from sb3_tdc.safe_load import read_system_info
 
 # The part of a run that is late in training
 _LATE = 1 / 3
@@ -90,7 +89,7 @@ class Run:
         """
         try:
             _ = self.is_finished, self.evaluations, self.steps, self.system
-        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        except (OSError, KeyError, TypeError, ValueError) as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise ValueError(f"{self.folder.path} has a file that cannot be read ({reason})") from error
 
@@ -171,8 +170,7 @@ class Run:
             return " · ".join(f"{name} {value}" for name, value in versions.items())
         if not self.folder.model.is_file():
             return ""
-        with zipfile.ZipFile(self.folder.model) as archive:
-            lines = archive.read("system_info.txt").decode().splitlines()
+        lines = read_system_info(self.folder.model).splitlines()
         return " · ".join(line.lstrip("- ") for line in lines)
 
     @property

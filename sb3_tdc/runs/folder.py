@@ -1,13 +1,10 @@
 """Where a run keeps its files: RL Zoo's layout, ``logs/tdc/Walker2d-v4_1/…``."""
 
-import json
 import re
 import shlex
 import shutil
 import sys
 import uuid
-import zipfile
-import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +14,9 @@ from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.checks import suggest
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import make_numbered, numbered, write_atomically
+from sb3_tdc.common.saved_fields import integer
 from sb3_tdc.common.versions import commit_of_the_code, library_versions, processor_name
+from sb3_tdc.safe_load import read_data
 from sb3_tdc.safe_load.regular_files import read_text
 
 _MAX_YAML = 2**18  # bytes; what train.py and RL Zoo write has some thousands
@@ -191,11 +190,8 @@ class RunFolder:
 
         :raises ValueError: if it cannot be read
         """
-        try:
-            with zipfile.ZipFile(self.model) as archive:
-                return int(json.loads(archive.read("data"))["num_timesteps"])
-        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise ValueError(f"{self.model} cannot be read ({type(error).__name__}: {error})") from error
+        steps = read_data(self.model).get("num_timesteps")
+        return integer(0)(f"{self.model}: num_timesteps", steps)
 
     @property
     def _config(self) -> Path:

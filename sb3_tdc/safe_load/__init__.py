@@ -7,7 +7,14 @@ anything is decompressed or allocated. What that covers, and what not: docs/safe
 """
 
 from sb3_tdc.safe_load.budget import UnsafeFileError
-from sb3_tdc.safe_load.models import load_safely, read_data
+from sb3_tdc.safe_load.models import load_safely, read_data, read_system_info
 from sb3_tdc.safe_load.objects import load_normalization, load_replay_buffer
 
-__all__ = ["UnsafeFileError", "load_normalization", "load_replay_buffer", "load_safely", "read_data"]
+__all__ = [
+    "UnsafeFileError",
+    "load_normalization",
+    "load_replay_buffer",
+    "load_safely",
+    "read_data",
+    "read_system_info",
+]

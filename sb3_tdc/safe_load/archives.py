@@ -18,12 +18,13 @@ MODEL_ENTRIES = re.compile(
 )
 
 
-def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget) -> dict[str, bytes]:
+def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget, only: str | None = None) -> dict[str, bytes]:
     """
     Read the entries of a zip, bounded before they are decompressed.
 
     :param allowed: what entries may be called
     :param budget: of all that is read from the file
+    :param only: the entry to read; None: all of them
     :return: the bytes of each entry
     :raises UnsafeFileError: for other, repeated, encrypted, oversized or suspiciously compressed entries, unread
     """
@@ -39,8 +40,9 @@ def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget) -> dict[s
                 raise UnsafeFileError(f"its entry {shown(entry.filename)} is encrypted or compressed in an unknown way")
             if entry.file_size > MAX_RATIO * max(entry.compress_size, 100):
                 raise UnsafeFileError(f"its entry {shown(entry.filename)} is compressed more than {MAX_RATIO}-fold")
-        budget.take_bytes(sum(entry.file_size for entry in entries))
-        return {entry.filename: _read_entry(archive, entry, budget) for entry in entries}
+        wanted = [entry for entry in entries if only in (None, entry.filename)]
+        budget.take_bytes(sum(entry.file_size for entry in wanted))
+        return {entry.filename: _read_entry(archive, entry, budget) for entry in wanted}
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: Budget) -> bytes:

@@ -115,8 +115,26 @@ def read_data(path: str | Path) -> dict[str, Any]:
     :raises UnsafeFileError: if it is not the zip of a saved model
     """
     with reading(f"{path} is not the zip of a saved model"):
-        with open_regular(path, MAX_BYTES) as (file, size):
-            return parse_data(read_archive(file, MODEL_ENTRIES, Budget(size))["data"])
+        return parse_data(_read_entry(path, "data"))
+
+
+def read_system_info(path: str | Path) -> str:
+    """
+    Read what SB3 notes of the system that a model was saved on.
+
+    :return: lines of text
+    :raises UnsafeFileError: if it is not the zip of a saved model
+    """
+    with reading(f"{path} is not the zip of a saved model"):
+        return _read_entry(path, "system_info.txt").decode()
+
+
+def _read_entry(path: str | Path, name: str) -> bytes:
+    with open_regular(path, MAX_BYTES) as (file, size):
+        entries = read_archive(file, MODEL_ENTRIES, Budget(size), only=name)
+    if name not in entries:
+        raise UnsafeFileError(f"it has no {name}")
+    return entries[name]
 
 
 def names_code(path: str | Path) -> bool:

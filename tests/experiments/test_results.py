@@ -1,12 +1,15 @@
 """Folders of runs → settings and arrays."""
 
+import shutil
+
 import numpy as np
 import pytest
 
 from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import group_runs
-from sb3_tdc.experiments.results import find_runs
+from sb3_tdc.experiments.results import Run, find_runs
 from tests.helpers.run_folders import make_run
+from tests.safe_load.attacks.tools import rewrite
 
 
 def test_folders_that_cannot_be_read_do_not_stop_the_others(tmp_path):
@@ -33,6 +36,28 @@ def test_a_damaged_file_is_listed_and_the_others_are_read(tmp_path, name, damage
     assert [run.seed for run in runs] == [2]
     assert len(unreadable) == 1
     assert str(broken.path) in unreadable[0]
+
+
+@pytest.mark.parametrize(
+    ("entries", "reason"),
+    [
+        ({"data": "[" * 10**5}, "recursion"),
+        ({"data": " " * 10**7 + "{}"}, "'data' is compressed more than 100-fold"),
+        ({"data": '{"num_timesteps": 1e999}'}, "num_timesteps must be an integer"),
+        ({"data": '{"a": 1}'}, "num_timesteps must be an integer"),
+        ({"system_info.txt": "x" * 10**7}, "'system_info.txt' is compressed more than 100-fold"),
+        ({"system_info.txt": None}, "it has no system_info.txt"),
+        ({"evil.pth": b""}, "'evil.pth' is unknown or repeated"),
+    ],
+)
+def test_a_model_is_read_within_bounds(tmp_path, entries, reason):
+    run = make_run(tmp_path)
+    (run.path / "Hopper-v4" / "versions.yml").unlink()  # of RL Zoo, whose system is that in the zip
+    assert Run.open(run.path).system == "OS: of the test · Python: 3"
+    deflate = any(len(content or "") > 10**6 for content in entries.values())
+    rewrite(shutil.copy(run.model, tmp_path / "model.zip"), run.model, deflate, **entries)
+    with pytest.raises(ValueError, match=f"has a file that cannot be read .*Hopper-v4.zip.*{reason}"):
+        Run.open(run.path)
 
 
 def test_a_run_of_rl_zoo_with_other_steps_on_its_command_line(tmp_path):
