@@ -80,7 +80,7 @@ def load_safely(
             if name not in fields:
                 raise UnsafeFileError(f"it has no {name}: give env")
         check_replay_memory(fields)
-        check_weights(policy_class, fields, tensors["policy"])
+        check_weights(policy_class, fields, tensors["policy"], budget)
         return _make_model(algorithm, policy_class, env, device, fields, tensors, new_temperature)
 
 

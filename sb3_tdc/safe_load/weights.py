@@ -108,8 +108,12 @@ class _OnMeta:
     device = th.device("meta")
 
 
-def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weights: Any) -> None:
-    """Compare the weights of the file with the networks that its arguments ask for, before these are built."""
+def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weights: Any, budget: Budget) -> None:
+    """
+    Compare the weights of the file with the networks that its arguments ask for, before these are built.
+
+    :param budget: of the file. Tensors may be parts of one storage, so the networks can be larger than what was read
+    """
     kwargs = {**fields.get("policy_kwargs", {}), "optimizer_class": th.optim.SGD, "optimizer_kwargs": {}}
     if "stochastic_actor" in fields:
         kwargs["stochastic_actor"] = fields["stochastic_actor"]
@@ -121,19 +125,20 @@ def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weight
             policy = shaped(fields["observation_space"], fields["action_space"], lambda _: 1.0, **kwargs)
     finally:
         th.distributions.Distribution.set_default_validate_args(validates)
-    expected = {name: tuple(tensor.shape) for name, tensor in policy.state_dict().items()}
+    networks = policy.state_dict()
+    expected = {name: tuple(tensor.shape) for name, tensor in networks.items()}
     if not isinstance(weights, dict) or not all(isinstance(tensor, th.Tensor) for tensor in weights.values()):
         raise UnsafeFileError("policy.pth: it does not hold weights")
     found = {name: tuple(tensor.shape) for name, tensor in weights.items()}
-    types = {name: tensor.dtype for name, tensor in policy.state_dict().items()}
     for name in [*expected, *found]:
         if expected.get(name) != found.get(name):
             raise UnsafeFileError(
                 f"policy.pth: {escaped(str(name))} is {found.get(name, 'missing')}, but the environment and "
                 f"policy_kwargs make it {expected.get(name, 'nothing')}"
             )
-        if weights[name].dtype != types[name]:
-            raise UnsafeFileError(f"policy.pth: {escaped(str(name))} is of {weights[name].dtype}, not of {types[name]}")
+        if weights[name].dtype != (dtype := networks[name].dtype):
+            raise UnsafeFileError(f"policy.pth: {escaped(str(name))} is of {weights[name].dtype}, not of {dtype}")
+    budget.take_bytes(sum(tensor.numel() * tensor.itemsize for tensor in networks.values()))
     for name in find_non_finite(policy, weights):
         raise UnsafeFileError(f"policy.pth: {escaped(str(name))} has values that are not finite")
 

@@ -42,6 +42,7 @@ from sb3_tdc.safe_load.inert_pickle import read_pickle
 from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
+from tests.safe_load.attacks.tensors import one_storage
 from tests.safe_load.attacks.tools import Op, pickled
 from tests.safe_load.attacks.zips import understated
 
@@ -365,6 +366,13 @@ def test_tensors_that_say_more_than_their_bytes_are_refused(saved, tmp_path):
     assert "a shape that it cannot have" in refuse(
         rewrite(saved, tmp_path / "x.zip", **{"policy.pth": pth({"w": huge})})
     )
+
+
+def test_networks_may_not_be_far_larger_than_the_file(tmp_path):
+    assert "actor.optimizer.pth" in refuse(one_storage(tmp_path, None, width=256, depth=2))  # the networks are made
+    path = one_storage(tmp_path, None, width=2048, depth=4)
+    assert path.stat().st_size < 2**20
+    assert "far more memory than it has bytes" in refuse(path)
 
 
 def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):

@@ -2,10 +2,12 @@
 
 import io
 import zipfile
+from itertools import pairwise
 
 import torch as th
+from stable_baselines3 import TD3
 
-from tests.safe_load.attacks.tools import Op, pth, rewrite, tensor
+from tests.safe_load.attacks.tools import Op, pth, rewrite, tensor, with_fields
 
 
 def _policy(tree: bytes, **records: bytes):
@@ -27,6 +29,24 @@ def changed(name, change):
         return rewrite(model, folder / "x.zip", **{name: file.getvalue()})
 
     return make
+
+
+def one_storage(folder, model, width=2048, depth=16):
+    """A TD3 whose layers are all parts of the same numbers, most of them 0: a file of 0.3 MB, networks of 1.4 GiB."""
+    numbers, weights = th.zeros(width**2), {}
+    numbers[: width**2 // 64] = th.rand(width**2 // 64)  # all zeros would be compressed more than a hundredfold
+    for role in ("", "_target"):
+        for network, n_inputs in ((f"actor{role}.mu", 3), (f"critic{role}.qf0", 4), (f"critic{role}.qf1", 4)):
+            for i, (n_in, n_out) in enumerate(pairwise([n_inputs, *[width] * depth, 1])):
+                weights[f"{network}.{2 * i}.weight"] = numbers[: n_out * n_in].view(n_out, n_in)
+                weights[f"{network}.{2 * i}.bias"] = numbers[:n_out]
+    file = io.BytesIO()
+    th.save(weights, file)
+    kwargs = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 100, "device": "cpu"}
+    TD3("MlpPolicy", "Pendulum-v1", **kwargs).save(folder / "td3.zip")
+    large = with_fields(folder / "td3.zip", folder / "large.zip", policy_kwargs={"net_arch": [width] * depth})
+    rewrite(io.BytesIO(file.getvalue()), folder / "policy.pth", deflate=True)
+    return rewrite(large, folder / "x.zip", **{"policy.pth": (folder / "policy.pth").read_bytes()})
 
 
 _NUMBERS = bytes(40)
@@ -62,6 +82,7 @@ ATTACKS = {
     ),
     "no temperature": lambda folder, model: rewrite(model, folder / "x.zip", **{"pytorch_variables.pth": None}),
     "a temperature that is None": changed("pytorch_variables.pth", lambda s: dict.fromkeys(s)),
+    "layers of one storage": one_storage,
     "weights that are a list": changed("policy.pth", lambda s: list(s.values())),
     "weights of another type": changed("policy.pth", lambda s: {name: value.half() for name, value in s.items()}),
     "numbers in the order of another processor": _policy(_GOOD, data_0=_NUMBERS, byteorder=b"big"),
