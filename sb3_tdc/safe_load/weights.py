@@ -195,7 +195,8 @@ def _is_state(value: Any, expected: Any, shape: th.Size) -> bool:
         return math.isfinite(value) and value >= 0
     if not isinstance(value, th.Tensor) or not value.dtype.is_floating_point:
         return False
-    fits = value.numel() == 1 if is_number else value.shape == shape
+    # Moments of another type would each be converted, also those that are parts of one storage
+    fits = value.numel() == 1 if is_number else value.shape == shape and value.dtype == expected.dtype
     return fits and bool(value.isfinite().all()) and not (is_number and value.item() < 0)
 
 

@@ -391,6 +391,7 @@ def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
     refuse_with("policy.pth", {**weights, "more": th.zeros(1)}, "more is")
     for change, match in (
         (lambda s: s["state"][0].update(exp_avg=th.zeros(1)), "'exp_avg' of parameter 0 is not what it can be"),
+        (lambda s: s["state"][0].update(exp_avg=s["state"][0]["exp_avg"].half()), "'exp_avg' of parameter 0 is not"),
         (lambda s: s["state"][0].pop("exp_avg"), "state of parameter 0 lacks a part"),
         (lambda s: s["state"][0].update(step=th.tensor(float("nan"))), "'step' of parameter 0 is not"),
         (lambda s: s["state"].update({-1: s["state"][0]}), "a parameter that there is not"),
