@@ -102,9 +102,14 @@ def _array_of_buffer(call: Call, make: Rebuild) -> np.ndarray:
     return _array(raw, dtype, shape, order, make.budget)
 
 
-def _scalar(call: Call, make: Rebuild) -> Any:
+def _numpy_scalar(call: Call, make: Rebuild) -> Any:
+    """Return a number of numpy."""
     dtype, raw = _arguments(call, make, 2)
-    return _array(raw, dtype, (), "C", make.budget).item()
+    return _array(raw, dtype, (), "C", make.budget)[()]
+
+
+def _scalar(call: Call, make: Rebuild) -> Any:
+    return _numpy_scalar(call, make).item()
 
 
 # -------------------------------------------------------------------- spaces
@@ -207,8 +212,8 @@ def _train_freq(call: Call, make: Rebuild) -> TrainFreq:
     return TrainFreq(check_integer("frequency", frequency, 1), unit)
 
 
-def _ordered_dict(call: Call, make: Rebuild) -> dict[Any, Any]:
-    return {key: make(item) for key, item in call.items}
+def _ordered_dict(call: Call, make: Rebuild) -> OrderedDict[Any, Any]:
+    return OrderedDict((key, make(item)) for key, item in call.items)
 
 
 def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
@@ -248,19 +253,28 @@ def _object(make: Callable[[Call, Rebuild], Any]) -> Handler:
     return Handler(make, state=True)
 
 
+def _of_numpy(make_scalar: Callable[[Call, Rebuild], Any]) -> dict[Name, Handler]:
+    return {
+        Name("numpy", "dtype"): Handler(_dtype, args=(1, 3), state=True),
+        # numpy 2 moved what numpy 1 had in numpy.core
+        **{
+            Name(f"numpy.{core}.{module}", function): handler
+            for core in ("core", "_core")
+            for module, function, handler in (
+                ("multiarray", "_reconstruct", Handler(_array_of_state, args=(3, 3), state=True)),
+                ("multiarray", "scalar", Handler(make_scalar, args=(2, 2))),
+                ("numeric", "_frombuffer", Handler(_array_of_buffer, args=(4, 4))),
+            )
+        },
+    }
+
+
+_MAPPING = {Name("collections", "OrderedDict"): Handler(_ordered_dict, items=True)}
+# Of plain values; numbers of numpy stay numbers of numpy
+PLAIN_CALLS: dict[Name, Handler] = {**_MAPPING, **_of_numpy(_numpy_scalar)}
 CALLS: dict[Name, Handler] = {
-    Name("collections", "OrderedDict"): Handler(_ordered_dict, items=True),
-    Name("numpy", "dtype"): Handler(_dtype, args=(1, 3), state=True),
-    # numpy 2 moved what numpy 1 had in numpy.core
-    **{
-        Name(f"numpy.{core}.{module}", function): handler
-        for core in ("core", "_core")
-        for module, function, handler in (
-            ("multiarray", "_reconstruct", Handler(_array_of_state, args=(3, 3), state=True)),
-            ("multiarray", "scalar", Handler(_scalar, args=(2, 2))),
-            ("numeric", "_frombuffer", Handler(_array_of_buffer, args=(4, 4))),
-        )
-    },
+    **_MAPPING,
+    **_of_numpy(_scalar),
     # gymnasium was gym
     **{
         Name(f"{gym}.spaces.{module}", space): _object(make)

@@ -17,7 +17,7 @@ from sb3_tdc.common.words import count
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.fields import MAX_REPLAY_BYTES
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Rebuild, read_pickle
-from sb3_tdc.safe_load.known_objects import CALLS, pickled_name
+from sb3_tdc.safe_load.known_objects import CALLS, PLAIN_CALLS, pickled_name
 from sb3_tdc.safe_load.reading import reading
 from sb3_tdc.safe_load.regular_files import open_regular
 from sb3_tdc.safe_load.sb3_fields import MAX_ENVS
@@ -105,15 +105,36 @@ def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
 
 
 def _arrays_like(buffer: ReplayBuffer) -> Callable[[Call, Rebuild], dict[str, Any]]:
-    """Of a replay buffer only its arrays of numbers, its position and its number of environments are looked at."""
+    """
+    Of a replay buffer only its arrays of numbers, its position and its number of environments are looked at, and the
+    infos of its transitions if hindsight computes rewards with them.
+    """
     names = [name for name, value in vars(buffer).items() if isinstance(value, dict) or _is_numeric(value)]
 
     def read_state(call: Call, make: Rebuild) -> dict[str, Any]:
         position = {"pos": integer(0)("pos", make(call.state["pos"])), "full": boolean("full", call.state["full"])}
         n_envs = integer(1, MAX_ENVS)("n_envs", make(call.state["n_envs"]))
-        return {**position, "n_envs": n_envs, **{name: make(call.state[name]) for name in names if name != "infos"}}
+        arrays = {name: make(call.state[name]) for name in names}
+        if isinstance(buffer, HerReplayBuffer) and buffer.copy_info_dict:
+            arrays["infos"] = _infos(call.state, make.budget)
+        return {**position, "n_envs": n_envs, **arrays}
 
     return read_state
+
+
+def _infos(state: dict[str, Any], budget: Budget) -> np.ndarray:
+    """Return the infos of a replay buffer (buffer_size, n_envs): mappings of plain values."""
+    if not boolean("copy_info_dict", state["copy_info_dict"]):
+        raise UnsafeFileError("it was saved without copy_info_dict, which this run has")
+    with reading("its infos (copy_info_dict), which may hold numbers, texts, arrays, lists and mappings"):
+        _, shape, _, is_fortran, infos = state["infos"].state
+        budget.take_bytes(len(infos) * np.dtype(object).itemsize)
+        if not isinstance(infos, list) or not all(type(info) is dict for info in infos):
+            raise UnsafeFileError("something else than a mapping for each transition")
+        make = Rebuild({}, PLAIN_CALLS, budget)
+        array = np.empty(len(infos), dtype=object)
+        array[:] = [make(info) if info else {} for info in infos]
+        return array.reshape(shape, order="F" if is_fortran else "C")
 
 
 def _is_numeric(value: Any) -> bool:

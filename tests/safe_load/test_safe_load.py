@@ -25,6 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import DDPG, SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import GoalSelectionStrategy
@@ -623,6 +624,57 @@ def test_a_replay_buffer_is_that_of_sb3(tmp_path, marker, name):
             load_replay_buffer(path, opened)
     path.write_bytes(pickle.dumps(Poison()))
     with pytest.raises(UnsafeFileError, match="does not hold a"):
+        load_replay_buffer(path, opened)
+    assert not marker.exists()
+
+
+class Weighted(BitFlippingEnv):
+    """Rewards depend on infos."""
+
+    def step(self, action):
+        *results, info = super().step(action)
+        kinds = {"weight": np.float32(0.1), "parts": [1, (2.5, None)], "name": "left", "of": {"forces": np.arange(3.0)}}
+        return *results, {**info, **kinds}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        if info is None:  # in a step of the environment
+            return super().compute_reward(achieved_goal, desired_goal, info)
+        return np.array([each["weight"] * each["of"]["forces"].sum() for each in info])
+
+
+def weighted(copies=True):
+    env = Weighted(n_bits=3, continuous=True)
+    kwargs = {**HER, "replay_buffer_kwargs": {"copy_info_dict": copies}}
+    return SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [4]}, **kwargs, **TINY)
+
+
+def test_infos_of_hindsight_are_those_of_sb3(tmp_path, marker):
+    path = tmp_path / "buffer.pkl"
+    model = weighted().learn(60)
+    model.save_replay_buffer(path)
+    opened, reference = weighted(), weighted()
+    load_replay_buffer(path, opened)
+    reference.load_replay_buffer(path)
+    assert str(opened.replay_buffer.infos.tolist()) == str(reference.replay_buffer.infos.tolist())
+    assert type(opened.replay_buffer.infos[5, 0]["weight"]) is np.float32
+    opened.learn(30)  # rewards of new goals are computed with them
+
+    for poison in (Poison(), collections.deque([1]), [{"object": pickle.Pickler}], np.array([None])):
+        model.replay_buffer.infos[7, 0]["contact"] = poison
+        model.save_replay_buffer(path)
+        with pytest.raises(UnsafeFileError, match=r"infos \(copy_info_dict\), which may hold .*: (a|an) "):
+            load_replay_buffer(path, opened)
+    del model.replay_buffer.infos[7, 0]["contact"]
+    model.replay_buffer.infos = model.replay_buffer.infos[:50]
+    model.save_replay_buffer(path)
+    with pytest.raises(UnsafeFileError, match="its infos are not those of this run"):
+        load_replay_buffer(path, opened)
+    model.replay_buffer.infos[3, 0] = 3
+    model.save_replay_buffer(path)
+    with pytest.raises(UnsafeFileError, match="something else than a mapping for each transition"):
+        load_replay_buffer(path, opened)
+    weighted(copies=False).save_replay_buffer(path)
+    with pytest.raises(UnsafeFileError, match="saved without copy_info_dict, which this run has"):
         load_replay_buffer(path, opened)
     assert not marker.exists()
 
