@@ -3,7 +3,7 @@
 import time
 
 MAX_OPCODES = 1_000_000  # SB3 writes some thousands for a model
-MAX_NODES = 200_000  # values, each counted as often as it is reached
+MAX_NODES = 500_000  # values, each counted as often as it is reached; infos of so many take about all operations
 MAX_SECONDS = 4.0  # beyond what the bytes of a large file take
 BYTES = 2**28  # that a small file may grow to
 GROWTH = 8  # times the size of a large one: entries, copies, arrays

@@ -642,10 +642,10 @@ class Weighted(BitFlippingEnv):
         return np.array([each["weight"] * each["of"]["forces"].sum() for each in info])
 
 
-def weighted(copies=True):
+def weighted(copies=True, **kwargs):
     env = Weighted(n_bits=3, continuous=True)
-    kwargs = {**HER, "replay_buffer_kwargs": {"copy_info_dict": copies}}
-    return SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [4]}, **kwargs, **TINY)
+    kwargs = {**HER, **TINY, "replay_buffer_kwargs": {"copy_info_dict": copies}, **kwargs}
+    return SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [4]}, **kwargs)
 
 
 def test_infos_of_hindsight_are_those_of_sb3(tmp_path, marker):
@@ -677,6 +677,16 @@ def test_infos_of_hindsight_are_those_of_sb3(tmp_path, marker):
     with pytest.raises(UnsafeFileError, match="saved without copy_info_dict, which this run has"):
         load_replay_buffer(path, opened)
     assert not marker.exists()
+
+
+def test_infos_of_tens_of_thousands_of_transitions_are_not_too_many(tmp_path):
+    model = weighted(buffer_size=50_000)
+    for i in range(50_000):
+        model.replay_buffer.infos[i, 0] = {"TimeLimit.truncated": False, "is_success": 0.0, "distance": i / 10, "n": i}
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    opened = weighted(buffer_size=50_000)
+    load_replay_buffer(tmp_path / "buffer.pkl", opened)
+    assert opened.replay_buffer.infos[-1, 0]["n"] == 49_999
 
 
 def test_observations_of_the_fused_update_load_into_a_fresh_model(tmp_path):
