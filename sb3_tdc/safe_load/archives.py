@@ -3,6 +3,7 @@
 import io
 import re
 import zipfile
+from collections import Counter
 from typing import IO
 
 from sb3_tdc.common.untrusted import shown
@@ -32,9 +33,10 @@ def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget, only: str
         raise UnsafeFileError("it is a zip of too many entries")
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
-        names = [entry.filename for entry in entries]
+        times = Counter(entry.filename for entry in entries)
         for entry in entries:
-            if not allowed.fullmatch(entry.filename) or names.count(entry.filename) > 1:
+            budget.check_time()
+            if not allowed.fullmatch(entry.filename) or times[entry.filename] > 1:
                 raise UnsafeFileError(f"its entry {shown(entry.filename)} is unknown or repeated")
             if entry.flag_bits & 1 or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise UnsafeFileError(f"its entry {shown(entry.filename)} is encrypted or compressed in an unknown way")

@@ -10,6 +10,7 @@ import pickle
 import re
 import shutil
 import struct
+import time
 import tracemalloc
 import warnings
 import zipfile
@@ -45,7 +46,7 @@ from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
 from tests.safe_load.attacks.tensors import one_storage
 from tests.safe_load.attacks.tools import Op, pickled
-from tests.safe_load.attacks.zips import understated
+from tests.safe_load.attacks.zips import crowd, understated
 
 
 @pytest.fixture(scope="module")
@@ -475,6 +476,12 @@ def test_reading_entries_takes_its_time_from_the_budget(saved):
     budget.take_bytes = lambda _: setattr(budget, "deadline", 0.0)  # spent after the first look
     with open(saved, "rb") as file, pytest.raises(UnsafeFileError, match="takes too long"):
         read_archive(file, MODEL_ENTRIES, budget)
+
+
+def test_entries_are_counted_once(saved, tmp_path):
+    start = time.process_time()
+    assert "policy.pth: it does not hold weights" in refuse(crowd(tmp_path, saved))
+    assert time.process_time() - start < 1.5  # 0.2 s; looking for each among all takes 4
 
 
 def test_a_compressed_copy_opens(saved, tmp_path):

@@ -5,7 +5,7 @@ import struct
 import zipfile
 import zlib
 
-from tests.safe_load.attacks.tools import Op, rewrite
+from tests.safe_load.attacks.tools import Op, pth, rewrite
 
 
 def layers(folder, model):
@@ -51,4 +51,16 @@ def understated(folder, model, says=60 * 2**20, inflates_to=1000 * 2**20):
     return path
 
 
-ATTACKS = {"two layers": layers, "two layers, four times": many_layers, "half a GiB of zeros": text}
+def crowd(folder, model, n=15_000):
+    """Thousands of empty storages in a file of tensors."""
+    empty = {f"data_{i:05}": b"" for i in range(n)}
+    return rewrite(model, folder / "x.zip", deflate=True, **{"policy.pth": pth(Op.PROTO + Op.NONE + Op.STOP, **empty)})
+
+
+ATTACKS = {
+    "two layers": layers,
+    "two layers, four times": many_layers,
+    "half a GiB of zeros": text,
+    "an entry that inflates to more than it says": understated,
+    "fifteen thousand storages": crowd,
+}
