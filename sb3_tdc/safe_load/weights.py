@@ -4,10 +4,14 @@ import inspect
 import io
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import get_ident
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_tdc.common.checks import find_non_finite
 from sb3_tdc.common.untrusted import escaped, shown
@@ -25,6 +29,7 @@ _STORAGE_TYPES = {
     "ByteStorage": th.uint8, "BoolStorage": th.bool,
 }  # fmt: skip
 MAX_DIMENSIONS = 8
+MAX_PARAMETERS = 8192  # tensors; 256 critics of three hidden layers have 4,096 with their targets
 
 
 def read_tensors(raw: bytes, budget: Budget) -> Any:
@@ -108,6 +113,25 @@ class _OnMeta:
     device = th.device("meta")
 
 
+@contextmanager
+def _few_parameters(budget: Budget) -> Iterator[None]:
+    """Bound how many parameters networks are given, and how long that takes: also without memory, each takes 0.1 ms."""
+    thread, left = get_ident(), iter(range(MAX_PARAMETERS))
+
+    def count(*_: Any) -> None:
+        if get_ident() != thread:  # networks that others build meanwhile
+            return
+        budget.check_time()
+        if next(left, None) is None:
+            raise UnsafeFileError(f"networks of more than {MAX_PARAMETERS:,} tensors of parameters")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
 def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weights: Any, budget: Budget) -> None:
     """
     Compare the weights of the file with the networks that its arguments ask for, before these are built.
@@ -121,7 +145,7 @@ def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weight
     validates = th.distributions.Distribution._validate_args
     th.distributions.Distribution.set_default_validate_args(False)  # it would look at values, of which there are none
     try:
-        with reading("policy_kwargs"), th.device("meta"):
+        with reading("policy_kwargs"), th.device("meta"), _few_parameters(budget):
             policy = shaped(fields["observation_space"], fields["action_space"], lambda _: 1.0, **kwargs)
     finally:
         th.distributions.Distribution.set_default_validate_args(validates)

@@ -36,7 +36,7 @@ from sb3_tdc.ablations.calibration import CalibratedTDC
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import enjoy, inspect
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.safe_load import load_normalization, load_replay_buffer
+from sb3_tdc.safe_load import budget, load_normalization, load_replay_buffer, weights
 from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import foreign_names, saved_fields
@@ -44,6 +44,7 @@ from sb3_tdc.safe_load.inert_pickle import read_pickle
 from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
+from tests.safe_load.attacks.data import layers
 from tests.safe_load.attacks.tensors import one_storage
 from tests.safe_load.attacks.tools import Op, pickled
 from tests.safe_load.attacks.zips import crowd, understated
@@ -297,6 +298,17 @@ def test_absurd_sizes_are_refused_before_memory_is_taken(saved, tmp_path, fields
     assert message in refuse(with_fields(saved, tmp_path / "x.zip", **fields))
 
 
+@pytest.mark.parametrize("attack", [layers("td3", n_critics=256), layers("meow", n_blocks=256)], ids=["td3", "meow"])
+def test_networks_of_very_many_layers_are_refused_before_they_are_built(tmp_path, monkeypatch, attack):
+    path = attack(tmp_path, None)
+    assert "policy_kwargs: networks of more than 8,192 tensors of parameters" in refuse(path)
+    monkeypatch.setattr(weights, "MAX_PARAMETERS", 10**6)
+    monkeypatch.setattr(budget, "MAX_SECONDS", 1.0)
+    start = time.process_time()
+    assert "policy_kwargs: it takes too long to read" in refuse(path)
+    assert time.process_time() - start < 5  # 1 s; all of the networks take 16 and 67
+
+
 def test_a_smaller_buffer_than_the_files(saved, tmp_path):
     path = with_fields(saved, tmp_path / "x.zip", buffer_size=10**12)
     assert load_safely(path, buffer_size=5, device="cpu").buffer_size == 5
@@ -385,12 +397,12 @@ def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
     def refuse_with(name, content, match):
         assert re.search(match, refuse(rewrite(saved, tmp_path / "x.zip", **{name: pth(content)})))
 
-    weights = state("policy.pth")
-    first = next(iter(weights))
-    refuse_with("policy.pth", {**weights, first: weights[first] * float("nan")}, f"{first} has values.*not finite")
-    refuse_with("policy.pth", {**weights, first: weights[first].T.contiguous()}, rf"{first} is \(3, 8\)")
-    refuse_with("policy.pth", {k: v for k, v in weights.items() if k != first}, f"{first} is missing")
-    refuse_with("policy.pth", {**weights, "more": th.zeros(1)}, "more is")
+    good = state("policy.pth")
+    first = next(iter(good))
+    refuse_with("policy.pth", {**good, first: good[first] * float("nan")}, f"{first} has values.*not finite")
+    refuse_with("policy.pth", {**good, first: good[first].T.contiguous()}, rf"{first} is \(3, 8\)")
+    refuse_with("policy.pth", {k: v for k, v in good.items() if k != first}, f"{first} is missing")
+    refuse_with("policy.pth", {**good, "more": th.zeros(1)}, "more is")
     for change, match in (
         (lambda s: s["state"][0].update(exp_avg=th.zeros(1)), "'exp_avg' of parameter 0 is not what it can be"),
         (lambda s: s["state"][0].update(exp_avg=s["state"][0]["exp_avg"].half()), "'exp_avg' of parameter 0 is not"),
@@ -413,7 +425,7 @@ def test_weights_and_optimizers_that_do_not_fit_are_refused(saved, tmp_path):
     refuse_with("pytorch_variables.pth", {"policy": th.zeros(1)}, "log_ent_coef is missing")
     variables = state("pytorch_variables.pth")
     refuse_with("pytorch_variables.pth", {**variables, "policy": th.zeros(1)}, "'policy': it is unknown")
-    refuse_with("policy.pth", {**weights, first: weights[first].double()}, "is of torch.float64")
+    refuse_with("policy.pth", {**good, first: good[first].double()}, "is of torch.float64")
     assert "log_ent_coef is missing" in refuse(rewrite(saved, tmp_path / "x.zip", **{"pytorch_variables.pth": None}))
 
 
@@ -472,10 +484,10 @@ def test_no_more_of_an_entry_is_decompressed_than_it_says(saved, tmp_path):
 
 
 def test_reading_entries_takes_its_time_from_the_budget(saved):
-    budget = Budget(saved.stat().st_size)
-    budget.take_bytes = lambda _: setattr(budget, "deadline", 0.0)  # spent after the first look
+    spent = Budget(saved.stat().st_size)
+    spent.take_bytes = lambda _: setattr(spent, "deadline", 0.0)  # after the first look at it
     with open(saved, "rb") as file, pytest.raises(UnsafeFileError, match="takes too long"):
-        read_archive(file, MODEL_ENTRIES, budget)
+        read_archive(file, MODEL_ENTRIES, spent)
 
 
 def test_entries_are_counted_once(saved, tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sb3_tdc.algorithms import ALGORITHMS
 from tests.safe_load.attacks.tools import fields_of, rewrite, with_fields
 
 REQUIRED = (
@@ -24,6 +25,19 @@ VALUES = {
 }
 
 
+def layers(algorithm, **policy_kwargs):
+    """A model of another algorithm, whose networks have very many small layers."""
+
+    def make(folder, model):
+        made = ALGORITHMS[algorithm]("MlpPolicy", "Pendulum-v1", buffer_size=100, device="cpu")
+        made.save(folder / "model.zip")
+        return with_fields(
+            folder / "model.zip", folder / "x.zip", policy_kwargs={"net_arch": [1] * 64, **policy_kwargs}
+        )
+
+    return make
+
+
 def _with(name, value):
     return lambda folder, model: with_fields(model, folder / "x.zip", **{name: value})
 
@@ -43,6 +57,8 @@ ATTACKS = {
     "an enormous network": lambda folder, model: with_fields(
         model, folder / "x.zip", policy_kwargs={**_policy_kwargs(model), "net_arch": [10**6] * 60}
     ),
+    "networks of sixteen thousand layers": layers("td3", n_critics=256),
+    "a flow of as many": layers("meow", n_blocks=256),
     "nan": lambda folder, model: with_fields(model, folder / "x.zip", tau=np.nan),
 }
 
