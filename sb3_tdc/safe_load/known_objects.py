@@ -23,6 +23,7 @@ from sb3_tdc.common.checks import check_integer, check_number
 from sb3_tdc.common.noise import NormalNoiseRange
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
+from sb3_tdc.safe_load.reading import MAX_ITEMS
 
 MAX_DIMENSIONS = 8
 
@@ -127,6 +128,8 @@ def _dict_space(call: Call, make: Rebuild) -> spaces.Dict:
     (of_keys,) = _attributes(call, make, "spaces")
     if not isinstance(of_keys, dict) or not all(isinstance(key, str) for key in of_keys):
         raise UnsafeFileError("a Dict space without its spaces")
+    if len(of_keys) > MAX_ITEMS:  # networks are built for each of them
+        raise UnsafeFileError(f"a Dict space of {len(of_keys):,} parts, more than {MAX_ITEMS}")
     return spaces.Dict(OrderedDict(of_keys))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.budget import UnsafeFileError
 
-MAX_ITEMS = 64  # of a list or mapping in the arguments of a network or an optimizer
+MAX_ITEMS = 64  # of a list or mapping in the arguments of a network or an optimizer, and of a Dict space
 
 
 @contextmanager

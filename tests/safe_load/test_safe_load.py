@@ -45,6 +45,7 @@ from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
 from tests.safe_load.attacks.data import layers
+from tests.safe_load.attacks.pickles import images_of_many_names
 from tests.safe_load.attacks.tensors import one_storage
 from tests.safe_load.attacks.tools import Op, pickled
 from tests.safe_load.attacks.zips import crowd, understated
@@ -307,6 +308,13 @@ def test_networks_of_very_many_layers_are_refused_before_they_are_built(tmp_path
     start = time.process_time()
     assert "policy_kwargs: it takes too long to read" in refuse(path)
     assert time.process_time() - start < 5  # 1 s; all of the networks take 16 and 67
+
+
+def test_dict_spaces_of_very_many_parts_are_refused(saved, tmp_path):
+    path = with_fields(saved, tmp_path / "x.zip", observation_space=pickled(images_of_many_names(65)))
+    assert "a Dict space of 65 parts, more than 64" in refuse(path)
+    path = with_fields(saved, tmp_path / "x.zip", observation_space=pickled(images_of_many_names(64)))
+    assert "policy_kwargs" in refuse(path)
 
 
 def test_a_smaller_buffer_than_the_files(saved, tmp_path):

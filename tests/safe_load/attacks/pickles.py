@@ -64,20 +64,38 @@ def text_as_key() -> bytes:
     return Op.PROTO + Op.EMPTY_DICT + Op.text("\x1b[31m" + "k" * 10**7) + Op.NONE + Op.SETITEM + Op.STOP
 
 
+def array(content: bytes, kind: str, *shape: int) -> bytes:
+    dtype = Op.name("numpy", "dtype") + Op.tuple_of(Op.text(kind), Op.FALSE, Op.TRUE) + Op.REDUCE
+    raw = b"B" + len(content).to_bytes(4, "little") + content
+    arguments = Op.tuple_of(raw, dtype, Op.tuple_of(*map(Op.integer, shape)), Op.text("C"))
+    return Op.name("numpy._core.numeric", "_frombuffer") + arguments + Op.REDUCE
+
+
+def with_state(name: bytes, **attributes: bytes) -> bytes:
+    """The opcodes of an object that is made without arguments, and given its attributes."""
+    state = b"".join(Op.text(attribute) + value + Op.SETITEM for attribute, value in attributes.items())
+    return name + Op.EMPTY_TUPLE + b"\x81" + Op.EMPTY_DICT + state + Op.BUILD
+
+
+def dict_space(box: bytes, n: int) -> bytes:
+    parts = b"".join(Op.text(f"{i}") + box for i in range(n))
+    return with_state(Op.name("gymnasium.spaces.dict", "Dict"), spaces=Op.EMPTY_DICT + Op.MARK + parts + Op.SETITEMS)
+
+
+_BOX = Op.name("gymnasium.spaces.box", "Box")
+
+
 def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
     """One array, and many spaces that each copy it."""
-    array = Op.name("numpy._core.numeric", "_frombuffer")
-    data = b"B" + size.to_bytes(4, "little") + bytes(size)
-    dtype = Op.name("numpy", "dtype") + Op.tuple_of(Op.text("f4"), Op.FALSE, Op.TRUE) + Op.REDUCE
-    array += Op.tuple_of(data, dtype, Op.tuple_of(Op.integer(size // 4)), Op.text("C")) + Op.REDUCE + Op.put(1)
-    box = Op.name("gymnasium.spaces.box", "Box") + Op.EMPTY_TUPLE + b"\x81" + Op.EMPTY_DICT + Op.MARK
-    box += Op.text("low") + Op.get(1) + Op.text("high") + Op.get(1) + Op.SETITEMS + Op.BUILD
-    spaces = b"".join(Op.text(f"{i}") + box for i in range(n))
-    raw = (
-        Op.PROTO + array + Op.POP + Op.name("gymnasium.spaces.dict", "Dict") + Op.EMPTY_TUPLE + b"\x81" + Op.EMPTY_DICT
-    )
-    raw += Op.text("spaces") + Op.EMPTY_DICT + Op.MARK + spaces + Op.SETITEMS + Op.SETITEM + Op.BUILD
-    return raw + Op.STOP
+    box = with_state(_BOX, low=Op.get(1), high=Op.get(1))
+    return Op.PROTO + array(bytes(size), "f4", size // 4) + Op.put(1) + Op.POP + dict_space(box, n) + Op.STOP
+
+
+def images_of_many_names(n: int = 300) -> bytes:
+    """One image, for which a network is built as often as it is named."""
+    size = (1, 36, 36)
+    box = with_state(_BOX, low=array(bytes(36**2), "u1", *size), high=array(b"\xff" * 36**2, "u1", *size))
+    return Op.PROTO + box + Op.put(1) + Op.POP + dict_space(Op.get(1), n) + Op.STOP
 
 
 def noise_of_doubled_lists() -> bytes:
@@ -109,6 +127,9 @@ ATTACKS = {
     },
     "noise whose mean is lists doubled": lambda folder, model: with_fields(
         model, folder / "x.zip", action_noise=pickled(noise_of_doubled_lists())
+    ),
+    "three hundred names of an image": lambda folder, model: with_fields(
+        model, folder / "x.zip", observation_space=pickled(images_of_many_names())
     ),
     "sixty boxes of one array": lambda folder, model: with_fields(
         model, folder / "x.zip", observation_space=pickled(boxes_of_one_array())
