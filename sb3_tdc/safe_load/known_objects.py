@@ -26,6 +26,7 @@ from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
 from sb3_tdc.safe_load.reading import MAX_ITEMS
 
 MAX_DIMENSIONS = 8
+MAX_CHOICES = 65_536  # of a MultiDiscrete space, which are summed up one by one
 
 
 def pickled_name(cls: type) -> Name:
@@ -113,6 +114,13 @@ def _scalar(call: Call, make: Rebuild) -> Any:
     return _numpy_scalar(call, make).item()
 
 
+def _floats(value: Any, budget: Budget) -> np.ndarray:
+    """Convert numbers to those of eight bytes, which are paid for before."""
+    if isinstance(value, np.ndarray):
+        budget.take_bytes(8 * value.size)
+    return np.asarray(value, dtype=np.float64)
+
+
 # -------------------------------------------------------------------- spaces
 
 
@@ -140,7 +148,10 @@ def _discrete(call: Call, make: Rebuild) -> spaces.Discrete:
 
 
 def _multi_discrete(call: Call, make: Rebuild) -> spaces.MultiDiscrete:
-    return spaces.MultiDiscrete(*_attributes(call, make, "nvec"))
+    (nvec,) = _attributes(call, make, "nvec")
+    if not isinstance(nvec, np.ndarray) or nvec.size > MAX_CHOICES:
+        raise UnsafeFileError(f"a MultiDiscrete space whose nvec is no array of at most {MAX_CHOICES:,} numbers")
+    return spaces.MultiDiscrete(nvec)
 
 
 def _multi_binary(call: Call, make: Rebuild) -> spaces.MultiBinary:
@@ -175,7 +186,7 @@ def _noise_range(call: Call, make: Rebuild) -> NormalNoiseRange:
 
 
 def _noise_arrays(call: Call, make: Rebuild, sigma_name: str = "_sigma") -> tuple[np.ndarray, np.ndarray]:
-    mean, sigma = (np.asarray(value, dtype=float) for value in _attributes(call, make, "_mu", sigma_name))
+    mean, sigma = (_floats(value, make.budget) for value in _attributes(call, make, "_mu", sigma_name))
     if not (np.isfinite(mean).all() and np.isfinite(sigma).all()):
         raise UnsafeFileError("noise that is not finite")
     return mean, sigma
@@ -222,7 +233,7 @@ def _ordered_dict(call: Call, make: Rebuild) -> OrderedDict[Any, Any]:
 def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
     mean, var, count = _attributes(call, make, "mean", "var", "count")
     statistics = RunningMeanStd()
-    statistics.mean, statistics.var = np.asarray(mean, dtype=np.float64), np.asarray(var, dtype=np.float64)
+    statistics.mean, statistics.var = _floats(mean, make.budget), _floats(var, make.budget)
     statistics.count = check_number("count", count, 0.0)
     finite = np.isfinite(statistics.mean).all() and np.isfinite(statistics.var).all()
     if not finite or (statistics.var < 0).any() or statistics.mean.shape != statistics.var.shape:

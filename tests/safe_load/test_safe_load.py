@@ -45,7 +45,7 @@ from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
 from tests.safe_load.attacks.data import layers
-from tests.safe_load.attacks.pickles import images_of_many_names
+from tests.safe_load.attacks.pickles import choices_of_bytes, images_of_many_names, noise_of_bytes
 from tests.safe_load.attacks.tensors import one_storage
 from tests.safe_load.attacks.tools import Op, pickled
 from tests.safe_load.attacks.zips import crowd, understated
@@ -315,6 +315,15 @@ def test_dict_spaces_of_very_many_parts_are_refused(saved, tmp_path):
     assert "a Dict space of 65 parts, more than 64" in refuse(path)
     path = with_fields(saved, tmp_path / "x.zip", observation_space=pickled(images_of_many_names(64)))
     assert "policy_kwargs" in refuse(path)
+
+
+def test_numbers_of_eight_bytes_are_paid_for_before_they_are_made(saved, tmp_path):
+    assert "the field action_noise (custom_objects can replace it): it would take far more memory" in refuse(
+        noise_of_bytes(tmp_path, saved)
+    )
+    assert "a MultiDiscrete space whose nvec is no array of at most 65,536 numbers" in refuse(
+        choices_of_bytes(tmp_path, saved)
+    )
 
 
 def test_a_smaller_buffer_than_the_files(saved, tmp_path):

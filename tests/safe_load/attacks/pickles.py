@@ -1,6 +1,10 @@
 """Pickled fields that hang a reader, fill its memory, or drive the terminal that shows the refusal."""
 
-from tests.safe_load.attacks.tools import Op, pickled, with_fields
+import base64
+import json
+import os
+
+from tests.safe_load.attacks.tools import Op, fields_of, pickled, rewrite, with_fields
 
 FIELDS = (
     *("policy_class", "policy_kwargs", "observation_space", "action_space", "learning_rate", "lam", "action_noise"),
@@ -106,6 +110,25 @@ def noise_of_doubled_lists() -> bytes:
     return lists + noise + state + Op.BUILD + Op.STOP
 
 
+def of_bytes(field: str, name: bytes, *attributes: str, size: int = 40_000_000):
+    """An object of one array of one-byte numbers, of which it makes eight-byte ones, in a file of 1 MB."""
+
+    def make(folder, model):
+        numbers = array(b"\1" * size, "u1", size) + Op.put(1) + Op.POP
+        raw = Op.PROTO + numbers + with_state(name, **dict.fromkeys(attributes, Op.get(1))) + Op.STOP
+        noise = base64.b64encode(
+            os.urandom(size // 60)
+        ).decode()  # all ones would be compressed more than a hundredfold
+        data = {**fields_of(model), field: pickled(raw), "tensorboard_log": noise}
+        return rewrite(model, folder / "x.zip", deflate=True, data=json.dumps(data))
+
+    return make
+
+
+noise_of_bytes = of_bytes(
+    "action_noise", Op.name("sb3_tdc.common.noise", "NormalNoiseRange"), "_mu", "smallest", "largest"
+)
+choices_of_bytes = of_bytes("observation_space", Op.name("gymnasium.spaces.multi_discrete", "MultiDiscrete"), "nvec")
 RAW = {
     "lists doubled": doubled,
     "tuples doubled": doubled_tuples,
@@ -128,6 +151,8 @@ ATTACKS = {
     "noise whose mean is lists doubled": lambda folder, model: with_fields(
         model, folder / "x.zip", action_noise=pickled(noise_of_doubled_lists())
     ),
+    "noise of forty million bytes": noise_of_bytes,
+    "a MultiDiscrete of forty million bytes": choices_of_bytes,
     "three hundred names of an image": lambda folder, model: with_fields(
         model, folder / "x.zip", observation_space=pickled(images_of_many_names())
     ),
