@@ -10,6 +10,7 @@ import pytest
 
 from tests.helpers.saved_models import MODELS
 from tests.safe_load.attacks import ATTACKS
+from tests.safe_load.attacks.__main__ import peak, reset_peak
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,6 +26,15 @@ def outcomes(tmp_path_factory):
     child = subprocess.run(command, cwd=folder / "empty", env=environment, capture_output=True, text=True, check=False)
     assert child.returncode == 0, child.stderr
     return json.loads(child.stdout)
+
+
+def test_memory_is_measured_for_each_attack_alone():
+    large = b"x" * 2**28
+    del large
+    before = reset_peak()
+    small = b"x" * 2**27
+    del small
+    assert 100 < (peak() - before) / 1024 < 150
 
 
 @pytest.mark.parametrize("name", ATTACKS)

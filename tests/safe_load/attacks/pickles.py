@@ -4,6 +4,9 @@ import base64
 import json
 import os
 
+from stable_baselines3 import TD3
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+
 from tests.safe_load.attacks.tools import Op, fields_of, pickled, rewrite, with_fields
 
 FIELDS = (
@@ -95,11 +98,17 @@ def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
     return Op.PROTO + array(bytes(size), "f4", size // 4) + Op.put(1) + Op.POP + dict_space(box, n) + Op.STOP
 
 
-def images_of_many_names(n: int = 300) -> bytes:
+def images_of_many_names(n: int = 900) -> bytes:
     """One image, for which a network is built as often as it is named."""
     size = (1, 36, 36)
     box = with_state(_BOX, low=array(bytes(36**2), "u1", *size), high=array(b"\xff" * 36**2, "u1", *size))
     return Op.PROTO + box + Op.put(1) + Op.POP + dict_space(Op.get(1), n) + Op.STOP
+
+
+def many_images(folder, model):
+    learned = TD3("MultiInputPolicy", SimpleMultiObsEnv(discrete_actions=False), buffer_size=10, device="cpu")
+    learned.save(folder / "dict.zip")
+    return with_fields(folder / "dict.zip", folder / "x.zip", observation_space=pickled(images_of_many_names()))
 
 
 def noise_of_doubled_lists() -> bytes:
@@ -153,9 +162,7 @@ ATTACKS = {
     ),
     "noise of forty million bytes": noise_of_bytes,
     "a MultiDiscrete of forty million bytes": choices_of_bytes,
-    "three hundred names of an image": lambda folder, model: with_fields(
-        model, folder / "x.zip", observation_space=pickled(images_of_many_names())
-    ),
+    "nine hundred names of an image": many_images,
     "sixty boxes of one array": lambda folder, model: with_fields(
         model, folder / "x.zip", observation_space=pickled(boxes_of_one_array())
     ),
