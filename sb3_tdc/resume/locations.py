@@ -18,19 +18,25 @@ class Locations:
     :param folders: how the run's folder was reached from there: its absolute path, with and without symbolic links
     :param folder: the run's folder now
     :param built: the texts that objects were built with, by path
+    :param given: the relative path with which relative locations in the run's folder begin; empty if none are known
     """
 
     directory: str = ""
     folders: tuple[str, ...] = ()
     folder: str = ""
     built: dict[str, str] = field(default_factory=dict)
+    given: str = ""
 
     @classmethod
     def capture(cls, folder: Path, built: dict[str, str]) -> dict[str, Any]:
         """Return as JSON what :meth:`restore` takes."""
+        directory, resolved = os.getcwd(), os.path.realpath(folder)
+        # Below the run's folder it is ".", or "..": any text with a slash could be a file of it
+        is_telling = not folder.is_absolute() and not Path(directory).is_relative_to(resolved)
         return {
-            "directory": os.getcwd(),
-            "folders": list(dict.fromkeys([os.path.abspath(folder), os.path.realpath(folder)])),
+            "directory": directory,
+            "folders": list(dict.fromkeys([os.path.abspath(folder), resolved])),
+            "given": os.path.normpath(folder) if is_telling else "",
             "built": built,
         }
 
@@ -41,12 +47,17 @@ class Locations:
 
         :param folder: the run's folder now
         """
-        return cls(captured["directory"], tuple(captured["folders"]), str(folder), captured["built"])
+        directory, folders = captured["directory"], tuple(captured["folders"])
+        return cls(directory, folders, str(folder), captured["built"], captured.get("given", ""))
 
     def below(self, path: str) -> "Locations":
         """Return the same for a nested capture, whose paths begin after ``path``."""
         texts = {name.removeprefix(path): text for name, text in self.built.items() if name.startswith(path)}
         return replace(self, built=texts)
+
+    def of_names(self) -> "Locations":
+        """Return the same for texts that are names: none but an absolute one is taken for a location."""
+        return replace(self, given="")
 
     @property
     def is_copy(self) -> bool:
@@ -67,27 +78,26 @@ class Locations:
         :param is_path: whether it certainly is a location; else it is one if it, or what is there now, has a slash
         :return: the text in its place from now on
         """
+        if not self.folders:
+            return text
         then_or_now = f"{text}{existing}" if type(existing) is str else text
-        if not self.folders or not (is_path or os.sep in then_or_now or self._then(text) in self.folders):
+        inside = self._inside(text, is_path)
+        if inside is None and not is_path and os.sep not in then_or_now:
             return text
         if type(existing) is str and self.built.get(path) == text:
             return existing
-        inside = self.inside(text, is_path)
         return text if inside is None else os.path.normpath(os.path.join(self.folder, inside))
 
-    def inside(self, text: str, is_path: bool = True) -> str | None:
-        """Return a location relative to the run's folder; None if it lies elsewhere."""
-        then = self._then(text)
-        for folder in self.folders:
-            # In a run folder that is the working directory, any text with a slash would be a file of it
-            if not (is_path or os.path.isabs(text)) and folder == self.directory:
-                continue
-            if then == folder or then.startswith(folder.rstrip(os.sep) + os.sep):
-                return os.path.relpath(then, folder)
-        return None
+    def _inside(self, text: str, is_path: bool) -> str | None:
+        """Return a location relative to the run's folder; None if it lies elsewhere, or is none."""
+        if not (is_path or os.path.isabs(text) or (self.given and _is_in(os.path.normpath(text), self.given))):
+            return None
+        then = os.path.normpath(os.path.join(self.directory, text))
+        return next((os.path.relpath(then, folder) for folder in self.folders if _is_in(then, folder)), None)
 
-    def _then(self, text: str) -> str:
-        return os.path.normpath(os.path.join(self.directory, text))
+
+def _is_in(path: str, folder: str) -> bool:
+    return Path(path).is_relative_to(folder)
 
 
 UNMOVED = Locations()

@@ -110,7 +110,8 @@ def _restore_values(
         if node is not None:
             context.restore(node, value, path)
     logger = SimpleNamespace(**_logger_attributes(model))
-    context.restore_attributes(parts["logger"], logger, "logger", optional=True)
+    with context.names():
+        context.restore_attributes(parts["logger"], logger, "logger", optional=True)
     for name, value in vars(logger).items():
         if name != "output_formats":
             setattr(model._logger, name, value)

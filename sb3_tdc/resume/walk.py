@@ -10,6 +10,7 @@ the run is resumed.
 
 import types
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -251,6 +252,15 @@ class Restore:
         self.begin(value)
         self._numbers.pop()
         return value
+
+    @contextmanager
+    def names(self) -> Iterator[None]:
+        """Restore texts that are looked up: keys of dictionaries, columns of logs."""
+        locations, self.locations = self.locations, self.locations.of_names()
+        try:
+            yield
+        finally:
+            self.locations = locations
 
     def begin(self, value: Any) -> None:
         """What is inside a value may refer to it: name it before that is restored."""

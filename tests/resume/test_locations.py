@@ -5,10 +5,13 @@ import shutil
 import signal
 from pathlib import Path
 
+import gymnasium as gym
+import pandas as pd
 import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 
 from sb3_tdc.resume import ResumeStates
 from sb3_tdc.resume.locations import Locations
@@ -210,9 +213,34 @@ def test_what_was_built_with_another_location_stays_as_it_is_built_now(tmp_path,
     ],
 )
 def test_where_a_text_of_then_leads_to_now(text, existing, expected):
-    locations = Locations("/home", ("/home/runs/a",), "/new/a", {"x.path": "built/there", "x.name": "name"})
+    locations = Locations("/home", ("/home/runs/a",), "/new/a", {"x.path": "built/there", "x.name": "name"}, "runs/a")
     path = "x.name" if text == "name" else "x.path"
     assert locations.find(text, existing, path) == expected
+
+
+@pytest.mark.parametrize(
+    ("directory", "folder"), [(".", "/base/train"), ("train", "."), ("train/sub", ".."), ("train/sub", "/base/train")]
+)
+@pytest.mark.parametrize("text", ["train/loss", "train", "sub/loss", "rollout/reward", "../train/loss"])
+def test_a_relative_text_is_no_location_where_the_folder_was_not_given_so(
+    tmp_path, monkeypatch, directory, folder, text
+):
+    (tmp_path / "train" / "sub").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / directory)
+    captured = Locations.capture(Path(folder.replace("/base", str(tmp_path))), {})
+    locations = Locations.restore(captured, Path("/new/a"))
+    assert locations.find(text, None, "x") == text
+    assert locations.find(str(tmp_path / "train" / "loss"), None, "x") == "/new/a/loss"
+    as_path = os.path.relpath(tmp_path / "train" / "notes.txt")
+    assert locations.find(as_path, None, "x", is_path=True) == "/new/a/notes.txt"
+
+
+def test_a_relative_text_that_begins_as_the_folder_was_given_is_a_location(tmp_path, monkeypatch):
+    (tmp_path / "beside").mkdir()
+    monkeypatch.chdir(tmp_path / "beside")
+    locations = Locations.restore(Locations.capture(Path("../train/"), {}), Path("/new/a"))
+    assert locations.find("../train/loss", None, "x") == "/new/a/loss"
+    assert locations.find("train/loss", None, "x") == "train/loss"
 
 
 def test_a_run_folder_that_is_the_working_directory_does_not_take_every_text_with_a_slash():
@@ -220,6 +248,65 @@ def test_a_run_folder_that_is_the_working_directory_does_not_take_every_text_wit
     assert locations.find("rollout/reward", None, "x") == "rollout/reward"
     assert locations.find("/home/a/rollout/reward", None, "x") == "/new/a/rollout/reward"
     assert locations.find("notes.txt", None, "x", is_path=True) == "/new/a/notes.txt"
+
+
+class Means(BaseCallback):
+    """A user's callback that keeps numbers by name, and by file."""
+
+    def __init__(self, folder):
+        super().__init__()
+        self.folder = folder
+        self.means = dict.fromkeys(["train", "train/reward", ("train/reward", 1), Path(folder, "a"), f"{folder}/b"], 0)
+
+    def _on_step(self):
+        self.means = dict.fromkeys(self.means, self.num_timesteps)
+        return True
+
+
+def learn_with_columns(folder, stop_at=None):
+    """:return: the columns of ``progress.csv``, its rows without the times, and the means"""
+    small = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 200, "learning_starts": 5, "batch_size": 4}
+    model = SAC("MlpPolicy", gym.make("Pendulum-v1", max_episode_steps=20), seed=1, device="cpu", **small)
+    model.set_logger(configure(str(folder), ["csv"]))
+    states, means = ResumeStates(folder / "resume", freq=20, verbose=0), Means(folder)
+    states.select(model)
+    try:
+        model.learn(90, callback=[states, means, StopAt(stop_at)], log_interval=1)
+    except Stop:
+        return {}
+    finally:
+        states.store.close()
+        model.logger.close()
+    columns = pd.read_csv(folder / "progress.csv")
+    return {name: list(columns[name]) for name in sorted(columns) if name not in _TIMES}, list(means.means)
+
+
+_TIMES = ("time/fps", "time/time_elapsed")
+
+
+@pytest.mark.parametrize(
+    ("folder", "directory", "moved"),
+    [
+        ("{base}/train", ".", "{base}/train"),
+        ("{base}/train", "train/sub", "{base}/train"),
+        ("train", ".", "yours"),
+        ("..", "train/sub", "{base}/yours"),
+    ],
+)
+def test_names_that_look_like_files_of_the_run_stay_names(tmp_path, monkeypatch, folder, directory, moved):
+    folder, moved = Path(folder.format(base=tmp_path)), Path(moved.format(base=tmp_path))
+    monkeypatch.chdir(tmp_path)
+    whole, _ = learn_with_columns(tmp_path / "whole")
+    Path("train/sub").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / directory)
+    learn_with_columns(folder, stop_at=70)
+    monkeypatch.chdir(tmp_path)
+    if moved.name == "yours":
+        shutil.move("train", "yours")
+    columns, names = learn_with_columns(moved)
+    assert columns == whole
+    assert names[:3] == ["train", "train/reward", ("train/reward", 1)]
+    assert names[3:] == [moved / "a", str(moved / "b") if folder.is_absolute() else f"{folder}/b"]
 
 
 # ---------------------------------------------------------------- a model that the run started from

@@ -134,7 +134,8 @@ def restore_dict(context: Restore, content: Any, existing: Any, path: str) -> An
     context.begin(value)
     items = []
     for key_node, node in content["items"]:
-        key = context.restore(key_node, MISSING, path)
+        with context.names():
+            key = context.restore(key_node, MISSING, path)
         items.append((key, context.restore(node, there.get(key, MISSING), f"{path}[{key!r}]")))
     kind = OrderedDict if isinstance(value, OrderedDict) else dict  # not what a class makes of its methods
     kind.clear(value)
