@@ -3,7 +3,7 @@
 import hashlib
 from typing import Any
 
-from sb3_tdc.resume.walk import NotCapturedError, NotRestoredError, Restore, existing_as
+from sb3_tdc.resume.walk import Capture, NotCapturedError, NotRestoredError, Restore, existing_as
 
 
 def is_mujoco(name: str) -> Any:
@@ -37,6 +37,11 @@ def restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
         return source
     mujoco.mj_copyData(existing, existing.model, source)
     return existing
+
+
+def capture_mj_model(context: Capture, model: Any, path: str) -> None:
+    """Note that views of it are not the run's."""
+    context.owners.append(model.body_mass.base)
 
 
 def restore_mj_model(context: Restore, content: Any, existing: Any, path: str) -> Any:

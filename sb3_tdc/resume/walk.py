@@ -85,6 +85,7 @@ class Capture:
         self.texts: dict[str, str] = {}  # those that the objects were built with
         self.first_arrays: dict[str, int] = {}  # of attributes that are captured separately
         self.shared_elsewhere: dict[str, str] = {}  # memory, in such captures
+        self.owners: list[Any] = []  # of memory that is captured with an object: arrays in it need no numbers
         self.initial = initial
         self._known = {id(value): name for name, value in (known or {}).items()}
         self._seen: dict[int, int] = {}
@@ -141,7 +142,7 @@ class Capture:
 
     def capture_optional(self, value: Any, path: str) -> Any:
         """Return JSON, or MISSING for what cannot be captured or will not be restored."""
-        n_arrays, n_parts = len(self.arrays), len(self._parts)
+        n_arrays, n_parts, n_owners = len(self.arrays), len(self._parts), len(self.owners)
         seen, attributes = dict(self._seen), dict(self.attributes)
         try:
             node = self.capture(value, path)
@@ -153,7 +154,7 @@ class Capture:
         except Exception as error:
             is_named = isinstance(error, NotCapturedError)
             self.left_out.append(str(error) if is_named else f"{path} ({type(error).__name__}: {error})")
-            del self.arrays[n_arrays:], self._parts[n_parts:]
+            del self.arrays[n_arrays:], self._parts[n_parts:], self.owners[n_owners:]
             self._seen, self.attributes = seen, attributes
             return MISSING
         self.attributes[path] = node
@@ -335,23 +336,25 @@ def plain(
     capture: Callable[[Any], dict[str, Any]],
     restore: Callable[[Any, Any], Any],
     needs: Callable[[Any], str | None] = lambda content: None,
+    owner: Callable[[Any], Any] | None = None,
 ) -> Kind:
     """
     A kind whose state is a dict of plain values.
 
     :param restore: takes the existing value (MISSING if it has become another one) and this dict, returns the value
+    :param owner: takes the value, returns what arrays have as their base that are views of its memory
     """
+
+    def capture_content(context: Capture, value: Any, path: str) -> Any:
+        if owner is not None:
+            context.owners.append(owner(value))
+        return context.capture_attributes(capture(value), path)
 
     def restore_content(context: Restore, content: Any, existing: Any, path: str) -> Any:
         state = {name: context.restore(node, MISSING, f"{path}.{name}") for name, node in content.items()}
         return restore(existing if context.claims(existing) else MISSING, state)
 
-    return Kind(
-        matches,
-        lambda context, value, path: context.capture_attributes(capture(value), path),
-        restore_content,
-        needs=needs,
-    )
+    return Kind(matches, capture_content, restore_content, needs=needs)
 
 
 def uncovered(kinds: "Kinds", node: Any, initial: Any, path: str) -> Iterator[str]:

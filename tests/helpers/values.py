@@ -1,9 +1,11 @@
 """Values of every kind, built from recipes, and a comparison of two of them that knows nothing of the code it tests."""
 
 import collections
+import ctypes
 import dataclasses
 import enum
 import functools
+import mmap
 import pathlib
 import random
 import threading
@@ -11,6 +13,7 @@ import types
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 import torch as th
 
 
@@ -83,6 +86,33 @@ def cyclic():
     inside: list[Any] = [1]
     inside.append({"back": inside})
     return inside
+
+
+class Lends:
+    """An object whose memory numpy reaches by a protocol, as that of many libraries."""
+
+    def __init__(self, numbers):
+        self.array = np.array(numbers)
+        self.__array_interface__ = self.array.__array_interface__
+
+
+def lent_by_ctypes(numbers):
+    memory: Any = (ctypes.c_double * len(numbers))(*numbers)
+    return np.frombuffer(memory)
+
+
+def lent_by_mmap(numbers):
+    memory = mmap.mmap(-1, 8 * len(numbers))
+    memory[:] = np.array(numbers).tobytes()
+    return np.frombuffer(memory)
+
+
+def lent_by_numba(numbers):
+    numba = pytest.importorskip("numba")
+    return numba.njit(lambda array: array + 0.0)(np.array(numbers))
+
+
+LENT = [lent_by_ctypes, lent_by_mmap, lent_by_numba, lambda numbers: np.asarray(Lends(numbers))]
 
 
 # What is made anew by every call

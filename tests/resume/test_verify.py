@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from sb3_tdc.resume import ResumeStates
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.resume.kinds.table import KINDS
-from tests.helpers.values import BOXES, LEAVES, Node, alike, build
+from tests.helpers.values import BOXES, LEAVES, LENT, Node, alike, build
 from tests.tools.runs import Stop, StopAt
 
 
@@ -267,6 +267,36 @@ class Draws(Still):
 def make_model_on(env):
     small = {"policy_kwargs": {"net_arch": [2]}, "buffer_size": 200, "learning_starts": 100, "device": "cpu"}
     return SAC("MlpPolicy", env, seed=1, **small)
+
+
+class Walks(Still):
+    """An environment whose state is a new array in the memory of another library after every step."""
+
+    observation_space = gym.spaces.Box(-1e3, 1e3, (2,))
+
+    def __init__(self, lend):
+        self.lend, self.seen = lend, []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = self.lend(self.np_random.uniform(size=2))
+        return self.state.astype(np.float32), {}
+
+    def step(self, action):
+        self.state = self.lend(self.state + np.array([1.0, action[0]]))
+        self.seen.append(self.state.tolist())
+        return self.state.astype(np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("lend", LENT)
+def test_an_environment_with_its_state_in_such_memory_continues(tmp_path, lend):
+    seen = {}
+    for name, stops in (("whole", [None]), ("mine", [45, None])):
+        for stop_at in stops:
+            env = Walks(lend)
+            run(tmp_path / name, Holds(1, 2), stop_at, env)
+        seen[name] = env.seen
+    assert seen["mine"] == seen["whole"]
 
 
 def test_an_environment_whose_restore_fails_does_not_repeat_its_draws(tmp_path, monkeypatch):

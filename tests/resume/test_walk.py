@@ -11,6 +11,7 @@ import threading
 import types
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 import torch as th
@@ -21,6 +22,7 @@ from hypothesis.extra import numpy as hnp
 from sb3_tdc.resume.kinds.arrays import run_lengths
 from sb3_tdc.resume.kinds.table import KINDS
 from sb3_tdc.resume.walk import MISSING, Capture, NotCapturedError, NotRestoredError, Restore
+from tests.helpers.values import LENT
 
 
 class Colour(enum.Enum):
@@ -130,6 +132,83 @@ def test_generators_go_on(make):
     assert draw(restored) == expected
     (made,) = Restore(KINDS, context.arrays).restore(node, [], "generators")
     assert draw(made) == expected
+
+
+@pytest.mark.parametrize("lend", LENT)
+def test_arrays_in_memory_that_numpy_did_not_make_come_back(lend):
+    there = lend([3.0, 4.0])
+    assert there_and_back(lend([1.0, 2.0]), there) is there
+    assert there.tolist() == [1, 2]
+    fixed, short = lend([3.0, 4.0]), lend([3.0])
+    fixed.flags.writeable = False
+    for other in (MISSING, fixed, short, np.zeros(2, np.float32), None):
+        assert there_and_back(lend([1.0, 2.0]), other).tolist() == [1, 2]
+    assert (fixed.tolist(), short.tolist()) == ([3, 4], [3])
+
+
+@pytest.mark.parametrize("lend", LENT[:3])
+def test_views_of_such_memory_do_not_write_into_each_other(lend):
+    whole = lend([5.0, 6.0, 7.0])
+    there = [whole, whole[1:]]
+    assert [part.tolist() for part in there_and_back([lend([1.0, 2, 3]), lend([4.0, 5])], there)] == [[1, 2, 3], [4, 5]]
+    whole = lend([1.0, 2.0, 3.0])
+    assert [part.tolist() for part in there_and_back([whole, whole[1:]], there)] == [[1, 2, 3], [2, 3]]
+
+
+BALL = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+
+
+def fallen(n_steps):
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string(BALL))
+    for _ in range(n_steps):
+        mujoco.mj_step(data.model, data)
+    return data
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_views_of_mujoco_stay_views_and_their_numbers_are_kept_once(is_first):
+    def build(data):
+        views = [data.qpos, data.qvel[2:], data.body(1).xpos, data.model.body_mass]
+        return [views, data, data.model] if is_first else [data, data.model, views]
+
+    then, now, alone = fallen(5), fallen(0), Capture(KINDS)
+    alone.capture(then, "data")
+    there = build(now)
+    context = Capture(KINDS)
+    node = json.loads(json.dumps(context.capture(build(then), "value")))
+    assert len(context.arrays) == len(alone.arrays) + (4 if is_first else 0)
+    Restore(KINDS, context.arrays).restore(node, there, "value")
+    views = there[0] if is_first else there[2]
+    assert [view.tolist() for view in views] == [view.tolist() for view in build(then)[0 if is_first else 2]]
+    mujoco.mj_step(now.model, now)
+    assert views[0].tolist() == now.qpos.tolist() == fallen(6).qpos.tolist()
+
+
+def test_a_view_of_native_memory_is_there_with_its_shape_or_refused():
+    data, now = fallen(5), fallen(0)
+    context = Capture(KINDS)
+    node = json.loads(json.dumps(context.capture(data.qpos, "x")))
+    fixed = now.qpos
+    fixed.flags.writeable = False
+    for other, why in (
+        (MISSING, "is nothing"),
+        (np.zeros(7), "was a view"),
+        (now.qvel, "was a view"),
+        (fixed, "cannot"),
+    ):
+        with pytest.raises(NotRestoredError, match=f"^x .*{why}"):
+            Restore(KINDS, context.arrays).restore(node, other, "x")
+    assert Restore(KINDS, context.arrays).restore(node, data.qpos, "x").tolist() == data.qpos.tolist()
+
+
+def test_an_owner_of_memory_that_is_left_out_does_not_count():
+    data = fallen(5)
+    context = Capture(KINDS)
+    assert context.capture_optional([data, threading.Lock()], "x") is MISSING
+    node = context.capture_optional(data.qpos, "y")
+    there = fallen(0)
+    Restore(KINDS, context.arrays).restore(node, there.qpos, "y")
+    assert there.qpos.tolist() == data.qpos.tolist()
 
 
 def test_objects_are_kept_and_shared_ones_stay_shared():

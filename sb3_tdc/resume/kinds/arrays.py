@@ -6,6 +6,7 @@ import fractions
 import pathlib
 import uuid
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,12 @@ def capture_array(context: Capture, value: np.ndarray, path: str) -> Any:
         return {"shape": list(value.shape), "items": capture_items(context, list(value.flat), path)}
     if value.dtype.hasobject:
         raise NotCapturedError(f"{path} is an array of {value.dtype}")
+    content: dict[str, Any] = {}
     if is_native_memory(value):
-        return {"native": list(value.shape)}  # of an object that is captured itself
-    content: dict[str, Any] = {"memory": _memory_of(context, value, path), "part": _part(value)}
+        content["native"] = list(value.shape)
+        if any(_root(value).base is owner for owner in context.owners):
+            return content
+    content |= {"memory": _memory_of(context, value, path), "part": _part(value)}
     if (runs := run_lengths(value)) is not None:
         return content | {"runs": [context.add_array(part) for part in runs], "shape": list(value.shape)}
     return content | {"array": context.add_array(np.array(value))}
@@ -43,23 +47,32 @@ def capture_array(context: Capture, value: np.ndarray, path: str) -> Any:
 
 def restore_array(context: Restore, content: Any, existing: Any, path: str) -> Any:
     """Fill an array, in place where one of the same part of its memory is there."""
+    if "items" in content:
+        return _restore_objects(context, content, existing, path)
     if "native" in content:
         existing = existing_as(np.ndarray, existing, path)
         if not is_native_memory(existing) or list(existing.shape) != content["native"]:
             raise NotRestoredError(f"{path} was a view of native memory, of shape {content['native']}")
+        if "memory" not in content:
+            return existing
+    value = _numbers(context, content)
+    if _fits(existing, value, content) and context.claims_memory(content["memory"], _address(existing)):
+        existing[...] = value
         return existing
-    if "items" in content:
-        return _restore_objects(context, content, existing, path)
-    if "runs" in content:
-        starts, numbers = (context.array(part) for part in content["runs"])
-        counts = np.diff(starts, append=int(np.prod(content["shape"])))
-        value = np.repeat(numbers, counts).reshape(content["shape"])
-    else:
-        value = context.array(content["array"]).copy(order="K")
-    if not _fits(existing, value, content) or not context.claims_memory(content["memory"], _address(existing)):
+    if "native" not in content:
         return value
-    existing[...] = value
+    # A new array would be a view no more
+    if existing.dtype != value.dtype or existing.tobytes() != value.tobytes():
+        raise NotRestoredError(f"{path} is a view of native memory that cannot be written to")
     return existing
+
+
+def _numbers(context: Restore, content: Any) -> np.ndarray:
+    if "runs" not in content:
+        return context.array(content["array"]).copy(order="K")
+    starts, numbers = (context.array(part) for part in content["runs"])
+    counts = np.diff(starts, append=int(np.prod(content["shape"])))
+    return np.repeat(numbers, counts).reshape(content["shape"])
 
 
 def needs_of_array(content: Any) -> str | None:
@@ -83,16 +96,15 @@ def _restore_objects(context: Restore, content: Any, existing: Any, path: str) -
 
 
 def _fits(existing: Any, value: np.ndarray, content: Any) -> bool:
-    is_array = type(existing) is np.ndarray and existing.dtype == value.dtype and existing.shape == value.shape
-    return (
-        is_array and existing.flags.writeable and not is_native_memory(existing) and _part(existing) == content["part"]
-    )
+    if type(existing) is not np.ndarray or is_native_memory(existing) != ("native" in content):
+        return False
+    is_alike = existing.dtype == value.dtype and existing.shape == value.shape and _part(existing) == content["part"]
+    return is_alike and existing.flags.writeable
 
 
 def is_native_memory(array: np.ndarray) -> bool:
-    """Return whether the memory belongs to an object that numpy does not know."""
-    base = _root(array).base
-    return base is not None and not isinstance(base, (bytes, bytearray, memoryview, th.Tensor))
+    """Return whether the memory may belong to a native object that goes on writing to it, as MuJoCo's does."""
+    return type(_root(array).base).__name__ == "PyCapsule"
 
 
 def _root(array: np.ndarray) -> np.ndarray:
@@ -102,7 +114,11 @@ def _root(array: np.ndarray) -> np.ndarray:
 
 
 def _address(array: np.ndarray) -> int:
-    return _root(array).__array_interface__["data"][0]
+    """Return where the memory begins: that of the object it belongs to, if this tells."""
+    whole = _root(array)
+    with suppress(TypeError, ValueError, BufferError):
+        whole = np.frombuffer(whole.base, dtype=np.uint8)  # type: ignore[arg-type]
+    return whole.__array_interface__["data"][0]
 
 
 def _part(array: np.ndarray) -> list[Any] | None:

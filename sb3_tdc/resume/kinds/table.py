@@ -162,11 +162,12 @@ KINDS: Kinds = {
         mujoco.capture_mj_data,
         mujoco.restore_mj_data,
         needs=lambda content: "MuJoCo's MjData",
+        owner=lambda data: data.xpos.base,
     ),
     # Part of the MjData of every environment that has one; the two are compared there
     "MjModel": Kind(
         mujoco.is_mujoco("MjModel"),
-        lambda context, v, path: None,
+        mujoco.capture_mj_model,
         mujoco.restore_mj_model,
         needs=lambda content: "MuJoCo's MjModel",
     ),
