@@ -140,7 +140,7 @@ def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
         _tell_what_is_not_covered(context, state, f"{path}, environment {i}")
         numbers = [context.add_array(array) for array in state["arrays"]]
         captured.append({"why": state["why"], "content": state["content"], "arrays": numbers})
-    return [captured, context.capture_attributes(_own_attributes(env), path)]
+    return [captured, context.capture_attributes(_own_attributes(env), path, optional=True)]
 
 
 def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str) -> None:
@@ -171,7 +171,7 @@ def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) ->
     else:
         whys = [state["why"] or "there is no sb3_tdc.resume.Restorable around it" for state in states]
     context.restarted += [f"{path}, environment {i}: {why}" for i, why in enumerate(whys) if why is not None]
-    context.restore_attributes(attributes, env, path)
+    context.restore_attributes(attributes, env, path, optional=True)
     return existing
 
 

@@ -84,8 +84,9 @@ def restore_state(
             f"The callbacks were {', '.join(parts['names of callbacks'])}, and are {', '.join(names)}"
         )
     _restore_values(model, callback, parts, context, changed)
-    if parts["env"] is None:  # nothing of it could be captured
-        context.restarted.append("env is not in the state")
+    assert model.env is not None
+    if not context.has_restored(model.env.unwrapped):  # whatever has been of its wrappers
+        context.restarted.append("env is not in the state, or does not fit it")
     restarted = [why for why in context.restarted if why.startswith("env")]
     model.start_time = time.time_ns() - int(parts["seconds"] * 1e9)
     if restarted:
@@ -108,7 +109,8 @@ def _restore_values(
         context.restore_attributes(nodes, owner, path, optional=True)
     for node, value, path in ((parts["env"], model.env, "env"), (parts["callbacks"], callback, "callbacks")):
         if node is not None:
-            context.restore(node, value, path)
+            with context.optional(path):
+                context.restore(node, value, path)
     logger = SimpleNamespace(**_logger_attributes(model))
     with context.names():
         context.restore_attributes(parts["logger"], logger, "logger", optional=True)

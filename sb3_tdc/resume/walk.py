@@ -10,7 +10,7 @@ the run is resumed.
 
 import types
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -227,6 +227,7 @@ class Restore:
         self._seen: dict[int, Any] = {}
         self._numbers: list[int | None] = []  # of the values under way
         self._claimed: dict[int, Any] = {}
+        self._whole: dict[int, Any] = {}
         self._memory: dict[int, int] = {}
 
     def restore(self, node: Any, existing: Any, path: str) -> Any:
@@ -252,7 +253,12 @@ class Restore:
         value = self.kinds[tag].restore(self, content, existing, path)
         self.begin(value)
         self._numbers.pop()
+        self._whole[id(value)] = value  # alive, so that its id stays its own
         return value
+
+    def has_restored(self, value: Any) -> bool:
+        """Return whether an object has got back all of its state."""
+        return id(value) in self._whole
 
     @contextmanager
     def names(self) -> Iterator[None]:
@@ -272,7 +278,7 @@ class Restore:
         """Return whether an existing object may become a value: not if it has become another value already."""
         is_free = existing is not MISSING and id(existing) not in self._claimed
         if is_free:
-            self._claimed[id(existing)] = existing  # alive, so that its id stays its own
+            self._claimed[id(existing)] = existing  # alive, as above
         return is_free
 
     def claims_memory(self, memory: int, there: int) -> bool:
@@ -287,17 +293,21 @@ class Restore:
         """
         for name, node in nodes.items():
             existing = attributes_of(owner).get(name, MISSING)
-            depth = len(self._numbers)
-            try:
+            with self.optional(f"{path}.{name}") if optional else nullcontext():
                 value = self.restore(node, existing, f"{path}.{name}")
                 if value is not existing:
                     object.__setattr__(owner, name, value)
-            except Exception as error:
-                if not optional:
-                    raise
-                del self._numbers[depth:]
-                is_named = isinstance(error, NotRestoredError)
-                self.not_restored.append(str(error) if is_named else f"{path}.{name} ({type(error).__name__}: {error})")
+
+    @contextmanager
+    def optional(self, path: str) -> Iterator[None]:
+        """Leave what cannot be restored in this block as it is, and note it."""
+        depth = len(self._numbers)
+        try:
+            yield
+        except Exception as error:
+            del self._numbers[depth:]
+            is_named = isinstance(error, NotRestoredError)
+            self.not_restored.append(str(error) if is_named else f"{path} ({type(error).__name__}: {error})")
 
     def array(self, content: dict[str, int]) -> np.ndarray:
         """Return the array that a content stands for, to be copied."""

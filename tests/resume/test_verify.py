@@ -6,7 +6,9 @@ import re
 import threading
 import time
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
+from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.resume import ResumeStates
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.resume.kinds.table import KINDS
@@ -297,6 +301,120 @@ def test_an_environment_with_its_state_in_such_memory_continues(tmp_path, lend):
             run(tmp_path / name, Holds(1, 2), stop_at, env)
         seen[name] = env.seen
     assert seen["mine"] == seen["whole"]
+
+
+class Helped(VecEnvWrapper):
+    """A user's wrapper."""
+
+    def __init__(self, venv, helper):
+        super().__init__(venv)
+        self.helper, self.steps = helper, 0
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        self.steps += 1
+        return self.venv.step_wait()
+
+
+class OtherHelped(Helped):
+    pass
+
+
+def normalised(helper, wrapper=Helped):
+    return VecNormalize(wrapper(DummyVecEnv([lambda: Walks(np.array)]), helper))
+
+
+def statistics(env):
+    return [env.obs_rms.mean.tolist(), env.obs_rms.count, env.ret_rms.var.tolist(), env.returns.tolist()]
+
+
+@pytest.mark.parametrize(
+    ("helpers", "sentence"),
+    [
+        ([threading.Lock, threading.Lock], r"Not in the resume states: env\.venv\.helper is a _thread\.lock"),
+        ([lambda: Node(iter("a"))] * 2, r"Not in the resume states: env\.venv\.helper\.item is a .*iterator"),
+        ([Node, list], r"Not restored: env\.venv\.helper was a .*Node, and is a .*list"),
+    ],
+)
+def test_what_a_wrapper_of_environments_loses_is_named_and_all_else_continues(tmp_path, helpers, sentence):
+    whole, first, second = (normalised(helper()) for helper in (helpers[0], *helpers))
+    run(tmp_path / "whole", Holds(1, 2), env=whole)
+    run(tmp_path / "mine", Holds(1, 2), stop_at=45, env=first)
+    with pytest.warns(RuntimeWarning, match=sentence):
+        run(tmp_path / "mine", Holds(1, 2), env=second)
+    assert statistics(second) == statistics(whole)
+    assert second.venv.steps == whole.venv.steps == 100
+    assert second.get_attr("seen") == whole.get_attr("seen")
+
+
+class Simulator(gym.vector.VectorEnv):
+    """Two environments in one object that Python cannot see into."""
+
+    metadata: ClassVar = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+    num_envs, single_observation_space, single_action_space = 2, Still.observation_space, Still.action_space
+
+    def __init__(self):
+        self.lock, self.steps = threading.Lock(), 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.normal(size=(2, 1)).astype(np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        observations, ends = self.np_random.normal(size=(2, 1)).astype(np.float32), np.full(2, self.steps % 7 == 0)
+        infos = {"final_obs": observations, "_final_obs": ends} if ends[0] else {}
+        return observations, observations[:, 0], np.zeros(2, bool), ends, infos
+
+
+class Statistics(BaseCallback):
+    is_captured = False
+
+    def __init__(self, env):
+        super().__init__()
+        self.env, self.seen = env, {}
+
+    def _on_rollout_start(self):
+        returns, monitor = self.env.ret_rms, self.env.venv.venv
+        self.seen[self.num_timesteps] = returns.var.tolist(), returns.count, monitor.episode_count
+
+    def _on_step(self):
+        return True
+
+
+def test_what_lies_around_environments_that_cannot_be_captured_continues(tmp_path):
+    seen = []
+    for stop_at in (50, None):
+        monitor = VecMonitor(GymnasiumVecEnv(Simulator()), str(tmp_path / "monitor.csv"))
+        env = VecNormalize(VecFrameStack(monitor, 2))
+        told = pytest.warns(RuntimeWarning, match="new episodes") if stop_at is None else nullcontext()
+        watch = Statistics(env)
+        with told:
+            run(tmp_path / "states", watch, stop_at, env)
+        seen.append((watch.seen, (tmp_path / "monitor.csv").read_text().splitlines()[2:]))
+    (before, first_rows), (after, rows) = seen
+    assert min(after) == 40
+    assert after[40] == before[40]
+    assert rows[:4] == first_rows[:4]  # of the episodes that had ended
+    assert len(rows) == after[98][2]
+
+
+@pytest.mark.parametrize("is_outer", [True, False])
+def test_a_wrapper_of_another_class_starts_episodes_again_and_ends_nothing(tmp_path, is_outer):
+    def build(wrapper):
+        env = DummyVecEnv([lambda: Walks(np.array)])
+        return wrapper(VecNormalize(env), 1) if is_outer else VecNormalize(wrapper(env, 1))
+
+    run(tmp_path, Holds(1, 2), stop_at=45, env=build(Helped))
+    env = build(OtherHelped)
+    with pytest.warns(RuntimeWarning) as caught:
+        run(tmp_path, Holds(1, 2), env=env)
+    told = "\n".join(str(warning.message) for warning in caught)
+    assert f"Not restored: env{'' if is_outer else '.venv'} was a" in told
+    assert "Continuing with new episodes" in told
+    assert is_outer or env.ret_rms.count > 100
 
 
 def test_an_environment_whose_restore_fails_does_not_repeat_its_draws(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import numpy as np
 import torch as th
 from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_tdc.resume.walk import (
     MISSING,
@@ -272,6 +273,11 @@ def _uses_native_package(kind: type) -> str | None:
     return None
 
 
+def _is_of_parts(value: Any) -> bool:
+    """Return whether attributes go on without another one: statistics, without the environments below."""
+    return isinstance(value, (BaseCallback, VecEnvWrapper))
+
+
 def capture_object(context: Capture, value: Any, path: str) -> Any:
     """Return class and attributes."""
     kind = type(value)
@@ -279,8 +285,7 @@ def capture_object(context: Capture, value: Any, path: str) -> Any:
         raise NotCapturedError(f"{path} is a {name_of(kind)}, which uses {package}")
     if not getattr(value, "is_captured", True):
         return [name_of(kind), {}]
-    is_callback = isinstance(value, BaseCallback)
-    return [name_of(kind), context.capture_attributes(attributes_of(value), path, optional=is_callback)]
+    return [name_of(kind), context.capture_attributes(attributes_of(value), path, optional=_is_of_parts(value))]
 
 
 def restore_object(context: Restore, content: Any, existing: Any, path: str) -> Any:
@@ -288,9 +293,8 @@ def restore_object(context: Restore, content: Any, existing: Any, path: str) -> 
     name, nodes = content
     _claim(context, name, existing, path)
     context.begin(existing)
-    is_callback = isinstance(existing, BaseCallback)
-    context.restore_attributes(nodes, existing, path, optional=is_callback)
-    if getattr(existing, "is_captured", True) and not is_callback:
+    context.restore_attributes(nodes, existing, path, optional=_is_of_parts(existing))
+    if getattr(existing, "is_captured", True) and not _is_of_parts(existing):
         for extra in set(attributes_of(existing)) - set(nodes):
             delattr(existing, extra)
     return existing
