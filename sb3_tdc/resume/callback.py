@@ -283,7 +283,9 @@ class ResumeStates(BaseCallback):
         if new is None:
             return segments, self._digests
         _refuse_non_finite(step, replay_file.find_non_finite(buffer, new))
-        digest = self.store.write_shared(new.name, replay_file.write_segment(buffer, new))
+        infos, left_out = replay_file.capture_infos(buffer, new)
+        self._tell(left_out)
+        digest = self.store.write_shared(new.name, replay_file.write_segment(buffer, new, infos))
         segments = replay_file.needed([*segments, new], buffer.buffer_size)
         digests = {**self._digests, new.name: digest}
         return segments, {segment.name: digests[segment.name] for segment in segments}

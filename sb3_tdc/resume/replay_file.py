@@ -16,11 +16,12 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_tdc.resume.kinds.table import KINDS
-from sb3_tdc.resume.walk import Capture, Restore
+from sb3_tdc.resume.walk import MISSING, Capture, Initial, Restore
 
 # Written to once, when a transition is added. Whatever else a buffer holds is captured whole
 _RINGS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _INFOS = "infos"  # of HER, objects
+_INFOS_PATH = f"replay_buffer.{_INFOS}"
 # A slot's next observation may be the following slot's observation
 _NEXT, _CURRENT = "next_observations", "observations"
 
@@ -88,8 +89,49 @@ def find_non_finite(buffer: ReplayBuffer, segment: Segment) -> list[str]:
     return [f"replay_buffer.{name}" for name, ring in floats.items() if not np.isfinite(_take(ring, slots)).all()]
 
 
-def write_segment(buffer: ReplayBuffer, segment: Segment) -> Callable[[Path], None]:
-    """Return what writes the file of a segment."""
+def capture_infos(buffer: ReplayBuffer, segment: Segment) -> tuple[np.ndarray, list[str]]:
+    """
+    Capture HER's ``copy_info_dict``: the values that are made from their content alone, whatever there is on resume.
+
+    :return: JSON text and its arrays in one array of bytes; a sentence for each value that is left out
+    """
+    slots, infos = _slots(buffer, segment), vars(buffer).get(_INFOS)
+    if infos is None or not any(info for row in infos[slots] for info in row):
+        return np.zeros(0, dtype=np.uint8), []
+    rows: list[list[dict[Any, Any]]] = [list(row) for row in infos[slots]]
+    left_out: list[str] = []
+    context = _capture()
+    content = context.capture_optional(rows, _INFOS_PATH)
+    if content is MISSING:
+        rows = [[_what_comes_back(info, left_out) for info in row] for row in rows]
+        context = _capture()
+        content = context.capture(rows, _INFOS_PATH)
+    arrays = [[array.dtype.str, list(array.shape), array.tobytes().hex()] for array in context.arrays]
+    return np.frombuffer(json.dumps([content, arrays]).encode(), dtype=np.uint8), left_out
+
+
+def _what_comes_back(info: dict[Any, Any], left_out: list[str]) -> dict[Any, Any]:
+    kept = {}
+    for key, value in info.items():
+        context = _capture()
+        if context.capture_optional([[{key: value}]], _INFOS_PATH) is MISSING:  # as deep as it will be
+            left_out += [why.replace("[0][0]", "", 1) for why in context.left_out]
+        else:
+            kept[key] = value
+    return kept
+
+
+def _capture() -> Capture:
+    """When a run is resumed, the ring is empty: there are no objects that could get back what they held."""
+    return Capture(KINDS, initial=Initial({}, {}, {}))
+
+
+def write_segment(buffer: ReplayBuffer, segment: Segment, infos: np.ndarray) -> Callable[[Path], None]:
+    """
+    Return what writes the file of a segment.
+
+    :param infos: of :func:`capture_infos`
+    """
 
     def write(path: Path) -> None:
         slots = _slots(buffer, segment)
@@ -100,7 +142,7 @@ def write_segment(buffer: ReplayBuffer, segment: Segment) -> Callable[[Path], No
             differs[:-1] = ~_same_bits(following[:-1], current[1:])
             arrays |= {f"{name}:differs": differs, name: following[differs]}
         with path.open("wb") as file:
-            np.savez(file, infos=_infos(buffer, slots), **arrays)  # type: ignore[arg-type]
+            np.savez(file, infos=infos, **arrays)  # type: ignore[arg-type]
 
     return write
 
@@ -140,22 +182,11 @@ def _same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.equal(*words).all(axis=-1)
 
 
-def _infos(buffer: ReplayBuffer, slots: np.ndarray) -> np.ndarray:
-    """HER's ``copy_info_dict``, as JSON text and its arrays in one array of bytes."""
-    infos = vars(buffer).get(_INFOS)
-    if infos is None or not any(info for row in infos[slots] for info in row):
-        return np.zeros(0, dtype=np.uint8)
-    context = Capture(KINDS)
-    content = context.capture([list(row) for row in infos[slots]], "replay_buffer.infos")
-    arrays = [[array.dtype.str, list(array.shape), array.tobytes().hex()] for array in context.arrays]
-    return np.frombuffer(json.dumps([content, arrays]).encode(), dtype=np.uint8)
-
-
 def _restore_infos(buffer: ReplayBuffer, slots: np.ndarray, stored: np.ndarray) -> None:
     infos = vars(buffer).get(_INFOS)
     if infos is None or stored.size == 0:
         return
     content, arrays = json.loads(stored.tobytes())
     context = Restore(KINDS, [np.frombuffer(bytes.fromhex(b), dtype=d).reshape(shape) for d, shape, b in arrays])
-    for slot, row in zip(slots, context.restore(content, None, "replay_buffer.infos"), strict=True):
+    for slot, row in zip(slots, context.restore(content, None, _INFOS_PATH), strict=True):
         infos[slot] = row

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
@@ -23,8 +23,8 @@ from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.resume import ResumeStates
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.resume.kinds.table import KINDS
-from tests.helpers.values import BOXES, LEAVES, LENT, Node, alike, build
-from tests.tools.runs import Stop, StopAt
+from tests.helpers.values import BOXES, LEAVES, LENT, Colour, Node, alike, build
+from tests.tools.runs import Reach, Stop, StopAt
 
 
 class Holds(BaseCallback):
@@ -415,6 +415,70 @@ def test_a_wrapper_of_another_class_starts_episodes_again_and_ends_nothing(tmp_p
     assert f"Not restored: env{'' if is_outer else '.venv'} was a" in told
     assert "Continuing with new episodes" in told
     assert is_outer or env.ret_rms.count > 100
+
+
+class Informs(Reach):
+    """An environment with a value in its infos, besides others, from step 15 on."""
+
+    def __init__(self, leaf):
+        super().__init__()
+        self.leaf, self.count = leaf, 0
+
+    def step(self, action):
+        *results, info = super().step(action)
+        self.count += 1
+        info |= {"force": np.float32(self.count), "path": Path("a"), "colours": [Colour.RED]}
+        return (*results, info | {"part": build(self.leaf)} if self.count > 15 else info)
+
+
+def run_with_infos(folder, leaf, stop_at=None):
+    kwargs = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"copy_info_dict": True}}
+    kwargs |= {"policy_kwargs": {"net_arch": [2]}, "buffer_size": 200, "learning_starts": 60, "batch_size": 4}
+    model = SAC("MultiInputPolicy", Informs(leaf), seed=1, device="cpu", **kwargs)
+    states = ResumeStates(folder, freq=20, verbose=0)
+    try:
+        states.select(model)
+        model.learn(100, callback=[states, StopAt(stop_at)])
+    except Stop:
+        pass
+    finally:
+        states.store.close()
+    return [info for (info,) in model.replay_buffer.infos[:100]]
+
+
+@pytest.mark.parametrize(
+    "leaf",
+    [
+        "record",
+        ("list", ["red", "record"]),
+        ("dict", ["array", ("node", [])]),
+        "iterator",
+        "nan as a key",
+        "deep",
+        "counter",
+    ],
+)  # fmt: skip
+def test_what_will_not_come_back_of_infos_is_named_once_and_left_out(tmp_path, leaf):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        whole = run_with_infos(tmp_path, leaf, stop_at=70)
+    named = [str(warning.message) for warning in caught if "Not in the resume states" in str(warning.message)]
+    assert len(named) == 1
+    assert re.match(r"Not in the resume states: replay_buffer\.infos\[.part.\]", named[0])
+    infos = run_with_infos(tmp_path, leaf)
+    assert all("part" in info for info in whole[15:69] + infos[60:])
+    assert not any("part" in info for info in infos[15:60])
+    for info, expected in zip(infos[:60], whole, strict=False):
+        assert alike(info, {key: value for key, value in expected.items() if key != "part"})
+
+
+@pytest.mark.parametrize("leaf", ["array", ("dict", ["float32", "blue"]), ("deque", ["path", "int array"]), "counted"])
+def test_infos_that_are_made_from_their_content_come_back(tmp_path, leaf):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        whole = run_with_infos(tmp_path, leaf, stop_at=70)
+        infos = run_with_infos(tmp_path, leaf)
+    assert all(alike(info, expected) for info, expected in zip(infos[:60], whole, strict=False))
 
 
 def test_an_environment_whose_restore_fails_does_not_repeat_its_draws(tmp_path, monkeypatch):
