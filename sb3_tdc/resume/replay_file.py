@@ -6,6 +6,7 @@ whose slots have all been overwritten since is not needed any more. Observations
 next observation that equals the observation of the following slot, bit for bit, is not stored twice.
 """
 
+import ast
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -106,7 +107,7 @@ def capture_infos(buffer: ReplayBuffer, segment: Segment) -> tuple[np.ndarray, l
         rows = [[_what_comes_back(info, left_out) for info in row] for row in rows]
         context = _capture()
         content = context.capture(rows, _INFOS_PATH)
-    arrays = [[array.dtype.str, list(array.shape), array.tobytes().hex()] for array in context.arrays]
+    arrays = [[_text_of(array.dtype), list(array.shape), array.tobytes().hex()] for array in context.arrays]
     return np.frombuffer(json.dumps([content, arrays]).encode(), dtype=np.uint8), left_out
 
 
@@ -187,6 +188,17 @@ def _restore_infos(buffer: ReplayBuffer, slots: np.ndarray, stored: np.ndarray) 
     if infos is None or stored.size == 0:
         return
     content, arrays = json.loads(stored.tobytes())
-    context = Restore(KINDS, [np.frombuffer(bytes.fromhex(b), dtype=d).reshape(shape) for d, shape, b in arrays])
+    decoded = [np.frombuffer(bytes.fromhex(b), dtype=_dtype(text)).reshape(shape) for text, shape, b in arrays]
+    context = Restore(KINDS, decoded)
     for slot, row in zip(slots, context.restore(content, None, _INFOS_PATH), strict=True):
         infos[slot] = row
+
+
+def _text_of(dtype: np.dtype) -> str:
+    """As numpy's files have it: ``dtype.str`` of a type with fields does not name them."""
+    return dtype.str if dtype.names is None else repr(np.lib.format.dtype_to_descr(dtype))
+
+
+def _dtype(text: str) -> np.dtype:
+    description: Any = ast.literal_eval(text) if text.startswith("[") else text
+    return np.lib.format.descr_to_dtype(description)

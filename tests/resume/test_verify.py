@@ -472,7 +472,9 @@ def test_what_will_not_come_back_of_infos_is_named_once_and_left_out(tmp_path, l
         assert alike(info, {key: value for key, value in expected.items() if key != "part"})
 
 
-@pytest.mark.parametrize("leaf", ["array", ("dict", ["float32", "blue"]), ("deque", ["path", "int array"]), "counted"])
+@pytest.mark.parametrize(
+    "leaf", ["array", ("dict", ["float32", "blue"]), ("deque", ["path", "int array"]), "counted", "structured"]
+)
 def test_infos_that_are_made_from_their_content_come_back(tmp_path, leaf):
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
