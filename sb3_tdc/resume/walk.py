@@ -8,6 +8,7 @@ a class, a function). :func:`uncovered` says which of these were not there when 
 the run is resumed.
 """
 
+import itertools
 import types
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -91,6 +92,7 @@ class Capture:
         self._seen: dict[int, int] = {}
         self._alive: list[Any] = []
         self._memory: dict[int, int] = {}
+        self._new_memory = itertools.count()
         self._parts: list[tuple[int, str, str]] = []  # the memory of every array, its path, and how it is reached
         self._trail: list[str] = []  # the classes of the values under way
 
@@ -173,7 +175,8 @@ class Capture:
         :param address: where the memory begins that an array is a part of; None if it has no numbers
         :return: the number of this memory
         """
-        number = len(self._parts) if address is None else self._memory.setdefault(address, len(self._parts))
+        new = next(self._new_memory)
+        number = new if address is None else self._memory.setdefault(address, new)
         self._parts.append((number, path, f"{path} {part} {' '.join(self._trail)}"))
         return number
 

@@ -201,6 +201,13 @@ def test_a_view_of_native_memory_is_there_with_its_shape_or_refused():
     assert Restore(KINDS, context.arrays).restore(node, data.qpos, "x").tolist() == data.qpos.tolist()
 
 
+def test_memory_of_what_is_left_out_is_no_other_memory():
+    array, context = np.zeros(3), Capture(KINDS)
+    assert context.capture_optional([array, threading.Lock()], "x") is MISSING
+    context.capture([np.ones(3), array], "y")
+    assert context.shared_memory() == {}
+
+
 def test_an_owner_of_memory_that_is_left_out_does_not_count():
     data = fallen(5)
     context = Capture(KINDS)
