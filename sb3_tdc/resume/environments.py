@@ -5,11 +5,12 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_tdc.common.words import count
 from sb3_tdc.resume.event_files import capture_event_files, restore_event_files
 from sb3_tdc.resume.kinds.generators import GENERATORS
+from sb3_tdc.resume.kinds.objects import claim, uses_native_package
 from sb3_tdc.resume.locations import Locations
 from sb3_tdc.resume.walk import (
     MISSING,
@@ -19,6 +20,7 @@ from sb3_tdc.resume.walk import (
     Restore,
     attributes_of,
     existing_as,
+    name_of,
     uncovered,
 )
 
@@ -32,12 +34,8 @@ def capture_env(kinds: Kinds, env: gym.Env) -> dict[str, Any]:
     """
     monitors = _monitors(env)
     context = Capture(kinds, _known(monitors))
-    generators = {
-        name: {a: value for a, value in attributes_of(owner).items() if isinstance(value, GENERATORS)}
-        for name, owner in _owners(env).items()
-    }
     content: dict[str, Any] = {
-        "generators": {n: context.capture_attributes(g, n, optional=True) for n, g in generators.items()},
+        "generators": _capture_generators(context, _owners(env)),
         "monitors": [context.capture_attributes(_without_env(m), "Monitor", optional=True) for m in monitors],
     }
     whole = context.capture_optional([env, *(monitor.env for monitor in monitors)], "env")
@@ -68,9 +66,7 @@ def restore_env(
         return state["why"]
     monitors = _monitors(env)
     context = Restore(kinds, state["arrays"], _known(monitors), with_files=with_files, locations=locations)
-    for name, owner in _owners(env).items():
-        nodes = state["content"]["generators"].get(name, {})
-        context.restore_attributes(nodes, owner, name, optional=True)
+    _restore_generators(context, state["content"]["generators"], _owners(env))
     for monitor, attributes in zip(monitors, state["content"]["monitors"], strict=False):
         context.restore_attributes(attributes, monitor, "Monitor", optional=True)
     if state["why"] is not None:
@@ -107,6 +103,19 @@ def _owners(env: gym.Env) -> dict[str, Any]:
     spaces = ("action_space", "observation_space")
     parts = {f"{name}.{space}": vars(layer).get(space) for name, layer in layers.items() for space in spaces}
     return {name: owner for name, owner in (layers | parts).items() if owner is not None}
+
+
+def _capture_generators(context: Capture, owners: dict[str, Any]) -> dict[str, Any]:
+    generators = {
+        name: {a: value for a, value in attributes_of(owner).items() if isinstance(value, GENERATORS)}
+        for name, owner in owners.items()
+    }
+    return {name: context.capture_attributes(each, name, optional=True) for name, each in generators.items() if each}
+
+
+def _restore_generators(context: Restore, captured: dict[str, Any], owners: dict[str, Any]) -> None:
+    for name, owner in owners.items():
+        context.restore_attributes(captured.get(name, {}), owner, name, optional=True)
 
 
 # ---------------------------------------------------------------- vectorised environments
@@ -175,6 +184,71 @@ def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) ->
     return existing
 
 
+def _own_attributes(env: VecEnv) -> dict[str, Any]:
+    """What else there is is overwritten by every step."""
+    names = ("observation_space", "action_space", "_seeds", "_options")
+    return {name: vars(env)[name] for name in names}
+
+
+# ---------------------------------------------------------------- those that are one object
+
+
+def is_other_vec_env(value: Any) -> bool:
+    """Return whether a value has the environments, and none of them can be captured on its own."""
+    return isinstance(value, VecEnv) and not isinstance(value, (DummyVecEnv, SubprocVecEnv, VecEnvWrapper))
+
+
+def capture_other_vec_env(context: Capture, env: Any, path: str) -> Any:
+    """Return the class; generators, so that these continue whatever else does not; all attributes, or why not."""
+    generators = _capture_generators(context, _inside(env, path))
+    n_left_out, mark = len(context.left_out), context.mark()
+    attributes: dict[str, Any] = {}
+    if package := uses_native_package(type(env)):
+        context.left_out.append(f"{path} is a {name_of(type(env))}, which uses {package}")
+    else:
+        attributes = context.capture_attributes(attributes_of(env), path, optional=True)
+    why = next(iter(context.left_out[n_left_out:]), None)
+    if why is not None:  # numbers of handles without what they stand for would do harm
+        context.return_to(mark)
+        attributes = {}
+    return {"class": name_of(type(env)), "generators": generators, "attributes": attributes, "why": why}
+
+
+def restore_other_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
+    """Give environments their state, or note why their episodes have to start again."""
+    claim(context, content["class"], existing, path)
+    context.begin(existing)
+    _restore_generators(context, content["generators"], _inside(existing, path))
+    why = content["why"]
+    if why is None:
+        n_noted = len(context.not_restored)
+        context.restore_attributes(content["attributes"], existing, path, optional=True)
+        why = next(iter(context.not_restored[n_noted:]), None)
+        del context.not_restored[n_noted:]
+        for extra in set(attributes_of(existing)) - set(content["attributes"]):
+            delattr(existing, extra)
+    if why is not None:
+        context.restarted.append(why)
+    return existing
+
+
+def _inside(env: VecEnv, path: str) -> dict[str, Any]:
+    """Return vectorised environments, the environments in them, and all of their spaces, by path."""
+    found: list[tuple[str, Any]] = [(path, env)]
+    seen = {id(env)}
+    for place, part in found:  # grows
+        for name, value in attributes_of(part).items():
+            items = enumerate(value) if isinstance(value, (list, tuple)) else [(None, value)]
+            for i, item in items:
+                if isinstance(item, (gym.Env, gym.vector.VectorEnv, gym.Space)) and id(item) not in seen:
+                    seen.add(id(item))
+                    found.append((f"{place}.{name}" if i is None else f"{place}.{name}[{i}]", item))
+    return dict(found)
+
+
+# ---------------------------------------------------------------- event files
+
+
 def is_event_files(value: Any) -> bool:
     """Return whether a value writes event files."""
     return isinstance(value, TensorBoardOutputFormat)
@@ -192,9 +266,3 @@ def restore_output(context: Restore, content: Any, existing: Any, path: str) -> 
     if context.with_files:
         restore_event_files(output, state, context.step, context.locations)
     return output
-
-
-def _own_attributes(env: VecEnv) -> dict[str, Any]:
-    """What else there is is overwritten by every step."""
-    names = ("observation_space", "action_space", "_seeds", "_options")
-    return {name: vars(env)[name] for name in names}

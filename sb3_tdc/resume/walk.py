@@ -144,8 +144,7 @@ class Capture:
 
     def capture_optional(self, value: Any, path: str) -> Any:
         """Return JSON, or MISSING for what cannot be captured or will not be restored."""
-        n_arrays, n_parts, n_owners = len(self.arrays), len(self._parts), len(self.owners)
-        seen, attributes = dict(self._seen), dict(self.attributes)
+        mark = self.mark()
         try:
             node = self.capture(value, path)
             if self.initial is not None:
@@ -156,11 +155,23 @@ class Capture:
         except Exception as error:
             is_named = isinstance(error, NotCapturedError)
             self.left_out.append(str(error) if is_named else f"{path} ({type(error).__name__}: {error})")
-            del self.arrays[n_arrays:], self._parts[n_parts:], self.owners[n_owners:]
-            self._seen, self.attributes = seen, attributes
+            self.return_to(mark)
             return MISSING
         self.attributes[path] = node
         return node
+
+    def mark(self) -> Any:
+        """Return what :meth:`return_to` takes."""
+        return [len(each) for each in self._lists()], dict(self._seen), dict(self.attributes)
+
+    def return_to(self, mark: Any) -> None:
+        """Forget what has been captured since: it will not be in the state, nor may it be referred to."""
+        lengths, self._seen, self.attributes = mark
+        for each, length in zip(self._lists(), lengths, strict=True):
+            del each[length:]
+
+    def _lists(self) -> tuple[list[Any], ...]:
+        return self.arrays, self._parts, self.owners
 
     def add_array(self, array: np.ndarray) -> dict[str, int]:
         """Return what stands for it in JSON."""

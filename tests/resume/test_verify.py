@@ -356,15 +356,19 @@ class Simulator(gym.vector.VectorEnv):
     num_envs, single_observation_space, single_action_space = 2, Still.observation_space, Still.action_space
 
     def __init__(self):
-        self.lock, self.steps = threading.Lock(), 0
+        self.lock, self.steps, self.drawn = threading.Lock(), 0, []
+
+    def draw(self):
+        self.drawn.append(self.np_random.normal(size=(2, 1)).astype(np.float32))
+        return self.drawn[-1]
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        return self.np_random.normal(size=(2, 1)).astype(np.float32), {}
+        return self.draw(), {}
 
     def step(self, action):
         self.steps += 1
-        observations, ends = self.np_random.normal(size=(2, 1)).astype(np.float32), np.full(2, self.steps % 7 == 0)
+        observations, ends = self.draw(), np.full(2, self.steps % 7 == 0)
         infos = {"final_obs": observations, "_final_obs": ends} if ends[0] else {}
         return observations, observations[:, 0], np.zeros(2, bool), ends, infos
 
@@ -385,20 +389,23 @@ class Statistics(BaseCallback):
 
 
 def test_what_lies_around_environments_that_cannot_be_captured_continues(tmp_path):
-    seen = []
+    seen, drawn = [], []
     for stop_at in (50, None):
-        monitor = VecMonitor(GymnasiumVecEnv(Simulator()), str(tmp_path / "monitor.csv"))
+        simulator = Simulator()
+        monitor = VecMonitor(GymnasiumVecEnv(simulator), str(tmp_path / "monitor.csv"))
         env = VecNormalize(VecFrameStack(monitor, 2))
-        told = pytest.warns(RuntimeWarning, match="new episodes") if stop_at is None else nullcontext()
+        told = pytest.warns(RuntimeWarning, match="new episodes.*lock") if stop_at is None else nullcontext()
         watch = Statistics(env)
         with told:
             run(tmp_path / "states", watch, stop_at, env)
+        drawn.append([part.tolist() for part in simulator.drawn])
         seen.append((watch.seen, (tmp_path / "monitor.csv").read_text().splitlines()[2:]))
     (before, first_rows), (after, rows) = seen
     assert min(after) == 40
     assert after[40] == before[40]
     assert rows[:4] == first_rows[:4]  # of the episodes that had ended
     assert len(rows) == after[98][2]
+    assert drawn[1][1:5] == drawn[0][21:25]  # after that of the first reset, which training begins with
 
 
 @pytest.mark.parametrize("is_outer", [True, False])

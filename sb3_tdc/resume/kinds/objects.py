@@ -259,7 +259,8 @@ def is_python_object(value: Any) -> bool:
     return all(map(is_made_in_python, classes)) and has_attributes and is_small
 
 
-def _uses_native_package(kind: type) -> str | None:
+def uses_native_package(kind: type) -> str | None:
+    """Return the simulator that a class reaches by a number or a proxy, if any."""
     for cls in kind.__mro__:
         if cls.__module__.partition(".")[0] in _REACHED_BY_OBJECTS:
             continue
@@ -281,7 +282,7 @@ def _is_of_parts(value: Any) -> bool:
 def capture_object(context: Capture, value: Any, path: str) -> Any:
     """Return class and attributes."""
     kind = type(value)
-    if package := _uses_native_package(kind):
+    if package := uses_native_package(kind):
         raise NotCapturedError(f"{path} is a {name_of(kind)}, which uses {package}")
     if not getattr(value, "is_captured", True):
         return [name_of(kind), {}]
@@ -291,7 +292,7 @@ def capture_object(context: Capture, value: Any, path: str) -> Any:
 def restore_object(context: Restore, content: Any, existing: Any, path: str) -> Any:
     """Give an existing object its attributes."""
     name, nodes = content
-    _claim(context, name, existing, path)
+    claim(context, name, existing, path)
     context.begin(existing)
     context.restore_attributes(nodes, existing, path, optional=_is_of_parts(existing))
     if getattr(existing, "is_captured", True) and not _is_of_parts(existing):
@@ -320,14 +321,20 @@ def capture_optimizer(context: Capture, value: th.optim.Optimizer, path: str) ->
 def restore_optimizer(context: Restore, content: Any, existing: Any, path: str) -> Any:
     """Give an existing optimizer its moments."""
     name, state, others = content
-    _claim(context, name, existing, path)
+    claim(context, name, existing, path)
     context.begin(existing)
     existing.load_state_dict(context.restore(state, MISSING, f"{path}.state"))
     context.restore_attributes(others, existing, path)
     return existing
 
 
-def _claim(context: Restore, name: str, existing: Any, path: str) -> None:
+def claim(context: Restore, name: str, existing: Any, path: str) -> None:
+    """
+    Take an existing object as one that was captured.
+
+    :param name: of its class
+    :raises NotRestoredError: unless it is of this class, and has not been taken before
+    """
     if existing is MISSING or name_of(type(existing)) != name:
         found = "nothing" if existing is MISSING else f"a {name_of(type(existing))}"
         raise NotRestoredError(f"{path} was a {name}, and is {found}")

@@ -183,6 +183,12 @@ KINDS: Kinds = {
         environments.restore_vec_env,
         needs=lambda content: count(len(content[0]), "environment"),
     ),
+    "vectorised environments": Kind(
+        environments.is_other_vec_env,
+        environments.capture_other_vec_env,
+        environments.restore_other_vec_env,
+        needs=lambda content: f"a {content['class']}",
+    ),
     "event files": Kind(
         environments.is_event_files,
         environments.capture_output,
