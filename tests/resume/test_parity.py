@@ -19,7 +19,10 @@ SLOW = [
     *CROSS,
     "readable update",
     "ring overwritten, two environments",
+    "Ant-v5",
+    "MEOW",
     "SAC",
+    "TD3",
     "TQC, gSDE",
     "HER with infos",
     "AdvB-SAC",
@@ -51,8 +54,10 @@ def differences(folder, names):
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    return differences(tmp_path_factory.mktemp("parity"), QUICK)
+def quick(request, tmp_path_factory):
+    """Of the selected tests, together: a process takes seconds to start."""
+    selected = [item for item in request.session.items if "quick" in getattr(item, "fixturenames", ())]
+    return differences(tmp_path_factory.mktemp("parity"), [item.callspec.params["name"] for item in selected])
 
 
 @pytest.mark.parametrize("name", QUICK)
