@@ -102,6 +102,10 @@ class QuantileCritic(ContinuousCritic):
         return hidden.mean(dim=1, keepdim=True)
 
 
+# SB3's limits of log σ, and what its density of the tanh-Gaussian adds to 1 − a²; compiled code has them inside
+LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON = -20.0, 2.0, 1e-6
+
+
 class TanhGaussian(SquashedDiagGaussianDistribution):
     """SB3's distribution; a copy does not have the last sample, which may hold a graph of autograd."""
 

@@ -13,8 +13,15 @@ from torch import nn
 from torch.nn.modules import module as global_hooks
 from torch.optim import optimizer as global_optimizer_hooks
 
-from sb3_tdc.tdc.fused.passes import LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
-from sb3_tdc.tdc.policies import QuantileCritic, StackedLinear, TanhGaussian, TDCPolicy
+from sb3_tdc.tdc.policies import (
+    LOG_STD_MAX,
+    LOG_STD_MIN,
+    TANH_EPSILON,
+    QuantileCritic,
+    StackedLinear,
+    TanhGaussian,
+    TDCPolicy,
+)
 
 th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
 

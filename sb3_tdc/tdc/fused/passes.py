@@ -13,11 +13,10 @@ from typing import Any
 
 import torch as th
 
+from sb3_tdc.tdc.policies import LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
 from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 
 _LOG_SQRT_2_PI = 0.5 * math.log(2 * math.pi)
-# SB3's limits of log σ, and what its density of the tanh-Gaussian adds to 1 − a². Compiled code keeps them
-LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON = -20.0, 2.0, 1e-6
 
 _threshold_backward = th.ops.aten.threshold_backward.grad_input
 _tanh_backward = th.ops.aten.tanh_backward.grad_input

@@ -8,7 +8,7 @@ from tests.safe_load.attacks.tools import fields_of, rewrite, with_fields
 REQUIRED = (
     *("gamma", "lam", "tau", "kappa", "learning_rate", "qf_learning_rate", "batch_size", "buffer_size", "train_freq"),
     *("learning_starts", "gradient_steps", "num_timesteps", "policy_delay", "target_policy_noise", "ent_coef"),
-    *("target_noise_clip", "stochastic_actor", "action_noise", "replay_buffer_class", "policy_class", "_n_updates"),
+    *("target_noise_clip", "stochastic_actor", "action_noise", "policy_class", "_n_updates"),
 )
 VALUES = {
     "gamma": (1e300, -0.1, 1.01, "0.99", None, True, [0.99]),
