@@ -1,4 +1,4 @@
-"""The bar of a run on terminals of any width."""
+"""The bar of a run on terminals of any width, and the lines elsewhere."""
 
 import fcntl
 import os
@@ -34,3 +34,18 @@ def test_a_terminal_without_a_size_has_a_bar_too(monkeypatch, rows, columns, wid
     os.close(main)
     assert "20.0/20.0" in shown
     assert width - 2 <= len(shown) <= width
+
+
+def test_a_line_has_no_rate_of_hardly_any_steps(capsys):
+    """Right after a resume, often a single step, and an evaluation of some seconds."""
+    model = TDC("MlpPolicy", "Pendulum-v1", buffer_size=100, policy_kwargs={"net_arch": [4]}, device="cpu")
+    progress = ProgressCallback(bar=False)
+    model.learn(99, callback=progress)
+    model.learn(101, callback=progress, reset_num_timesteps=False)
+    model.num_timesteps = 100
+    progress.show_line("eval 1.0")
+    model.num_timesteps = 200
+    progress.show_line("eval 2.0")
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.split("|") == ["      100 steps  50.0% ", " eval 1.0"]
+    assert [part.split()[-1] for part in second.split("|")] == ["100.0%", "steps/s", "left", "2.0"]

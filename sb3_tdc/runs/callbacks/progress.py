@@ -14,6 +14,8 @@ from sb3_tdc.common.words import count
 # Without evaluations, a line so often
 _SECONDS_BETWEEN_LINES = 300.0
 _SECONDS_BETWEEN_BAR_UPDATES = 0.1
+# A run that is resumed right before an evaluation has taken one
+_STEPS_FOR_A_RATE = 50
 _DEFAULT_SIZE = {"ncols": 80, "nrows": 24}  # of a terminal that says 0, as a container's may
 
 
@@ -92,11 +94,12 @@ class ProgressCallback(BaseCallback):
         self.last_shown = time.monotonic()
         # The callback of an evaluation has counted this step already, this one has not
         steps = self.model.num_timesteps
-        rate = (steps - self.first_timestep) / max(self.last_shown - self.start, 1e-9)
-        left = timedelta(seconds=round((self.total_timesteps - steps) / rate)) if rate > 0 else "?"
-        share = 100 * steps / self.total_timesteps
-        line = f"{steps:>9,} steps {share:5.1f}% | {rate:.0f} steps/s | {left} left"
-        print(f"{line} | {text}" if text else line, flush=True)
+        parts = [f"{steps:>9,} steps {100 * steps / self.total_timesteps:5.1f}%"]
+        done = steps - self.first_timestep
+        if done >= _STEPS_FOR_A_RATE:
+            rate = done / max(self.last_shown - self.start, 1e-9)
+            parts += [f"{rate:.0f} steps/s", f"{timedelta(seconds=round((self.total_timesteps - steps) / rate))} left"]
+        print(" | ".join([*parts, text] if text else parts), flush=True)
 
 
 class _Evaluation(BaseCallback):
