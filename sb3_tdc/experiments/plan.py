@@ -145,6 +145,8 @@ def measure_rate(job: Job) -> float:
     """Return environment steps per second, with updates, without evaluations; on one thread, over a few hundred."""
     clock = _Clock()
     n_timesteps = max(_LAST, 10 * job.config.get("n_envs", 1))
+    config = replace(job, n_timesteps=n_timesteps).config
+    config["learning_starts"] = min(config.get("learning_starts", _FIRST), _FIRST)  # also where the job sets it
     with tempfile.TemporaryDirectory() as folder:
         settings = RunSettings(
             algo=job.algo,
@@ -152,7 +154,7 @@ def measure_rate(job: Job) -> float:
             n_timesteps=n_timesteps,
             seed=job.seed,
             log_folder=folder,
-            hyperparams=replace(job, n_timesteps=n_timesteps).config,
+            hyperparams=config,
             gym_packages=list(job.packages),
             eval_freq=-1,
             resume_freq=-1,

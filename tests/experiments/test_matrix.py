@@ -24,6 +24,7 @@ from sb3_tdc.experiments.jobs import Job, TrainedElsewhereError, eval_freq, stop
 from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.suites import SUITES, Cell
 from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.training import train
 from tests.helpers.matrices import SMALL_TDC, finish, is_running, runs_of
 from tests.helpers.matrices import start_matrix as start
 from tests.helpers.run_folders import make_run
@@ -252,6 +253,21 @@ def test_dry_run_measures(tmp_path, capsys, monkeypatch):
     assert out.count("steps/s") == 1
     assert "2 of 2 to run" in out
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("warm_up", [{}, {"learning_starts": 25_000}, {"learning_starts": 0}])
+def test_a_rate_is_measured_with_updates_whatever_the_warm_up(warm_up, tmp_path, monkeypatch):
+    outcomes = []
+
+    def train_and_keep(run):
+        outcomes.append(train(run))
+        return outcomes[-1]
+
+    monkeypatch.setattr(planning, "train", train_and_keep)
+    assert planning.measure_rate(Job("tdc", "Pendulum-v1", 1, 300_000, tmp_path, {**SMALL_TDC, **warm_up})) > 0
+    (outcome,) = outcomes
+    assert outcome.model.num_timesteps == 300
+    assert outcome.model._n_updates >= 200
 
 
 # ---------------------------------------------------------------- real matrices
