@@ -13,7 +13,6 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 from torch import nn
@@ -26,26 +25,19 @@ from sb3_tdc.common.checks import (
     check_number,
     check_within,
 )
-from sb3_tdc.common.dormant import dormant_share, relu_activations
-from sb3_tdc.common.layers import StackedLinear
-from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
-from sb3_tdc.common.versions import numba_version
-from sb3_tdc.tdc.fused import FusedUpdate, obstacles
-from sb3_tdc.tdc.lam import describe_selection
+from sb3_tdc.tdc.diagnostics import describe_critics, describe_units
+from sb3_tdc.tdc.fused import FusedUpdateAlgorithm
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, TDCPolicy
-from sb3_tdc.tdc.quantiles import (
-    Target,
-    lcb_target,
-    quantile_huber_gradient,
-    quantile_huber_loss,
-)
+from sb3_tdc.tdc.quantiles import Target, lcb_target, quantile_huber_gradient
 
 SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
-# The critics' diagnostics (docs/tdc.md) are taken at every fiftieth update: at every one they would slow it down
+# The critics' diagnostics (docs/tdc.md) are taken at every fiftieth update: at every one they would slow it down. The
+# first update is one of them, so that the first line of a log has them
 DIAGNOSTICS_INTERVAL = 50
-# Dormant units (docs/tdc.md) need forward passes, and change slowly
+# Dormant units (docs/tdc.md) need forward passes, and change slowly. Those of new networks say nothing: the first are
+# counted after so many updates
 UNITS_INTERVAL = 500
 
 # Where the gradient stays zero (dead ReLUs), Adam's moments decay into denormal numbers and never leave them: 0.9 times
@@ -53,7 +45,7 @@ UNITS_INTERVAL = 500
 FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
 
 
-class TDC(CheckedOffPolicyAlgorithm):
+class TDC(FusedUpdateAlgorithm):
     """
     Twin Distributional Critics with a λ-lower confidence bound (TDC-λ), Osman et al.
 
@@ -241,26 +233,6 @@ class TDC(CheckedOffPolicyAlgorithm):
         if self.stochastic_actor is not saved:
             raise ValueError(f"stochastic_actor must be {saved}, as in the saved model, got {self.stochastic_actor!r}")
 
-    def _initial_ent_coef(self) -> float:
-        coefficient = self.ent_coef
-        learned = isinstance(coefficient, str) and coefficient.startswith("auto")
-        if isinstance(coefficient, str) and learned:
-            coefficient = coefficient.removeprefix("auto").removeprefix("_") or "1.0"
-        try:
-            value = check_number("ent_coef", float(coefficient), 0.0)
-            if value > 0 or not learned:
-                return value
-        except (TypeError, ValueError):
-            pass
-        raise ValueError(
-            'ent_coef must be "auto", "auto_" and a positive number (as in "auto_0.1"), '
-            f"or a number of at least 0, got {self.ent_coef!r}"
-        )
-
-    @property
-    def _learns_ent_coef(self) -> bool:
-        return self.ent_coef_optimizer is not None
-
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
         if name == "qf_learning_rate" and self.qf_learning_rate is None:
             name = "learning_rate"
@@ -279,20 +251,6 @@ class TDC(CheckedOffPolicyAlgorithm):
         self._setup_fused_update()
         self._setup_temperature()
 
-    def _setup_fused_update(self) -> None:
-        self._fused_update: FusedUpdate | None = None
-        self._obstacles = obstacles(self)
-        if self._obstacles and self.fused:
-            raise ValueError(self._obstacle_message())
-        if self.verbose > 0 and self.fused is None:
-            self._tell_which_update()
-
-    def _tell_which_update(self) -> None:
-        update = f"readable update ({'; '.join(self._obstacles)})" if self._obstacles else "fused update"
-        numba = numba_version()
-        loops = f"loops compiled by Numba {numba}" if numba else 'no compiled loops: pip install "sb3-tdc[fast]"'
-        print(f"Using the {update}, {loops}")
-
     def _setup_temperature(self) -> None:
         initial = th.tensor([self._initial_ent_coef()], device=self.device)
         self.log_ent_coef = self.ent_coef_optimizer = self.ent_coef_tensor = None
@@ -306,13 +264,24 @@ class TDC(CheckedOffPolicyAlgorithm):
         else:
             self.ent_coef_tensor = initial
 
-    def _current_target_entropy(self) -> float:
-        if self.target_entropy == "auto":
-            return -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
-        return check_number('target_entropy (if not "auto")', self.target_entropy)
+    def _initial_ent_coef(self) -> float:
+        coefficient = self.ent_coef
+        learned = isinstance(coefficient, str) and coefficient.startswith("auto")
+        if isinstance(coefficient, str) and learned:
+            coefficient = coefficient.removeprefix("auto").removeprefix("_") or "1.0"
+        try:
+            value = check_number("ent_coef", float(coefficient), 0.0)
+            if value > 0 or not learned:
+                return value
+        except (TypeError, ValueError):
+            pass
+        raise ValueError(
+            'ent_coef must be "auto", "auto_" and a positive number (as in "auto_0.1"), '
+            f"or a number of at least 0, got {self.ent_coef!r}"
+        )
 
     def _renew_temperature(self) -> None:
-        """Make the temperature that ``ent_coef`` asks for, where its owner has changed it."""
+        """Make the temperature that ``ent_coef`` asks for, where it has been changed."""
         if self.ent_coef != self._built_ent_coef:
             self._setup_temperature()
 
@@ -347,7 +316,7 @@ class TDC(CheckedOffPolicyAlgorithm):
 
     def update(self, replay_data: ReplayBufferSamples, lam: float) -> None:
         """
-        One iteration of Algorithm 1.
+        Do one iteration of Algorithm 1.
 
         :param replay_data: a minibatch
         :param lam: λ
@@ -359,57 +328,8 @@ class TDC(CheckedOffPolicyAlgorithm):
         if self.diagnoses_units:
             self.diagnose_units(replay_data)
 
-    def _flush_moments(self) -> None:
-        """Set moments of Adam to zero that are about to become denormal numbers."""
-        optimizers: list[Any] = [self.actor.optimizer, self.critic.optimizer]
-        if self.stochastic_actor and self._learns_ent_coef:
-            optimizers.append(self.ent_coef_optimizer)
-        for state in (state for optimizer in optimizers for state in optimizer.state.values()):
-            for moment in (state[name] for name in ("exp_avg", "exp_avg_sq") if name in state):
-                moment.masked_fill_(moment.abs() < SMALLEST_MOMENT, 0)
-
-    def _update_learning_rates(self) -> None:
-        learning_rate = self.scheduled("learning_rate")
-        update_learning_rate(self.actor.optimizer, learning_rate)  # type: ignore[arg-type]
-        update_learning_rate(self.critic.optimizer, self.scheduled("qf_learning_rate"))
-        if self.ent_coef_optimizer is not None:
-            update_learning_rate(self.ent_coef_optimizer, learning_rate)
-
-    def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
-        """The same update on preallocated buffers, where it applies; it is made anew when anything has changed."""
-        bound = self._fused_update
-        if bound is not None and self.fused is not False and bound.fits(batch_size):
-            return bound
-        self._fused_update = None
-        if self.fused is False:
-            return None
-        known, self._obstacles = self._obstacles, obstacles(self)
-        if not self._obstacles:
-            self._fused_update = FusedUpdate(self, batch_size)
-        elif self.fused:
-            raise ValueError(self._obstacle_message())
-        if self.verbose > 0 and known != self._obstacles:
-            self._tell_which_update()
-        return self._fused_update
-
-    def overridden_methods(self) -> list[str]:
-        """Return the methods, replaced on the class or on this instance, that the fused update would not call."""
-        cls, attributes = type(self), vars(self)
-        return [name for name, own in _FUSED_METHODS.items() if getattr(cls, name) is not own or name in attributes]
-
-    def _obstacle_message(self) -> str:
-        return f"fused must be None or False here: {'; '.join(self._obstacles)}"
-
-    def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
-        """ã at s' from the target actor (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""
-        if self.stochastic_actor:
-            return self.actor_target(replay_data.next_observations, deterministic=False)
-        noise = th.randn_like(replay_data.actions).mul_(self.target_policy_noise)
-        noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
-        return noise.add_(self.actor_target(replay_data.next_observations)).clamp_(-1, 1)
-
     def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
-        """One step of the critics (Eq. 1–10)."""
+        """Take one step of the critics (Eq. 1–10)."""
         with th.no_grad():
             next_actions = self._sample_target_actions(replay_data)
             next_quantiles = self.critic_target(replay_data.next_observations, next_actions)  # Eq. 3
@@ -422,6 +342,14 @@ class TDC(CheckedOffPolicyAlgorithm):
         if self.diagnoses_critics:
             self.diagnose_critics(current_quantiles.detach(), target)
 
+    def _sample_target_actions(self, replay_data: ReplayBufferSamples) -> th.Tensor:
+        """Return ã at s' from the target actor, (B, A): a sample (Eq. 2), or the mean with clipped noise (Eq. 1)."""
+        if self.stochastic_actor:
+            return self.actor_target(replay_data.next_observations, deterministic=False)
+        noise = th.randn_like(replay_data.actions).mul_(self.target_policy_noise)
+        noise.clamp_(-self.target_noise_clip, self.target_noise_clip)
+        return noise.add_(self.actor_target(replay_data.next_observations)).clamp_(-1, 1)
+
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
         """
         Return the λ-LCB target (Eq. 4–7).
@@ -433,7 +361,7 @@ class TDC(CheckedOffPolicyAlgorithm):
         return lcb_target(next_quantiles, replay_data.rewards, replay_data.dones, discounts, lam)
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
-        """One step of the actor (Eq. 11–13), then of the temperature."""
+        """Take one step of the actor (Eq. 11–13), then of the temperature."""
         if self.stochastic_actor:
             actions, log_prob = self.actor.action_log_prob(replay_data.observations)  # type: ignore[operator]
             ent_coef = self.current_ent_coef()
@@ -447,13 +375,9 @@ class TDC(CheckedOffPolicyAlgorithm):
             self._minimize(actor_loss, self.actor.optimizer)  # type: ignore[arg-type]
             self.diagnose(actor_loss=actor_loss.detach())
 
-    def current_ent_coef(self) -> th.Tensor:
-        """Return (1,), α."""
-        return self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
-
     def update_temperature(self, log_prob: th.Tensor, ent_coef: th.Tensor, actor_loss: th.Tensor) -> None:
         """
-        One step of the temperature, if it is learned (Eq. 14).
+        Take one step of the temperature, if it is learned (Eq. 14).
 
         :param log_prob: (B,), of the actor's update
         :param ent_coef: (1,), α of the actor's update
@@ -467,9 +391,34 @@ class TDC(CheckedOffPolicyAlgorithm):
             self.log_ent_coef.grad = slope
             self.ent_coef_optimizer.step()
 
+    def current_ent_coef(self) -> th.Tensor:
+        """Return (1,), α."""
+        return self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
+
+    @property
+    def _learns_ent_coef(self) -> bool:
+        return self.ent_coef_optimizer is not None
+
+    def _current_target_entropy(self) -> float:
+        if self.target_entropy == "auto":
+            return -float(np.prod(self.action_space.shape))  # type: ignore[arg-type]
+        return check_number('target_entropy (if not "auto")', self.target_entropy)
+
+    @th.no_grad()
+    def update_targets(self) -> None:
+        """Move the target critics and the target actor by Polyak averaging (Eq. 16)."""
+        online, target = (self.critic, self.actor), (self.critic_target, self.actor_target)
+        th._foreach_lerp_(_parameters(target), _parameters(online), self.tau)
+        for of_online, of_target in zip(online, target, strict=True):  # the running statistics of batch norm
+            pairs = (get_parameters_by_name(network, ["running_"]) for network in (of_target, of_online))
+            for statistic, source in zip(*pairs, strict=True):
+                statistic.copy_(source)
+
+    # ---------------------------------------------------------------- optimizers
+
     @staticmethod
     def _minimize(output: th.Tensor, optimizer: th.optim.Optimizer, slope: th.Tensor | None = None) -> None:
-        """One step down a loss: the output, or what has this slope at the output."""
+        """Take one step down a loss: the output, or what has this slope at the output."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         learning = [parameter for parameter in parameters if parameter.requires_grad]
         for parameter in parameters:
@@ -479,83 +428,23 @@ class TDC(CheckedOffPolicyAlgorithm):
             output.backward(slope, inputs=learning)
         optimizer.step()
 
-    @th.no_grad()
-    def update_targets(self) -> None:
-        """Polyak averaging of critics and actor (Eq. 16)."""
-        online, target = (self.critic, self.actor), (self.critic_target, self.actor_target)
-        th._foreach_lerp_(_parameters(target), _parameters(online), self.tau)
-        for of_online, of_target in zip(online, target, strict=True):  # the running statistics of batch norm
-            pairs = (get_parameters_by_name(network, ["running_"]) for network in (of_target, of_online))
-            for statistic, source in zip(*pairs, strict=True):
-                statistic.copy_(source)
+    def _update_learning_rates(self) -> None:
+        learning_rate = self.scheduled("learning_rate")
+        update_learning_rate(self.actor.optimizer, learning_rate)  # type: ignore[arg-type]
+        update_learning_rate(self.critic.optimizer, self.scheduled("qf_learning_rate"))
+        if self.ent_coef_optimizer is not None:
+            update_learning_rate(self.ent_coef_optimizer, learning_rate)
 
-    def prepare_to_continue(self) -> None:
-        if self._n_updates > 0:
-            self._bind_fused_update(self.batch_size)  # it also chooses the actions
+    def _flush_moments(self) -> None:
+        """Set moments of Adam to zero that are about to become denormal numbers."""
+        optimizers: list[Any] = [self.actor.optimizer, self.critic.optimizer]
+        if self.stochastic_actor and self._learns_ent_coef:
+            optimizers.append(self.ent_coef_optimizer)
+        for state in (state for optimizer in optimizers for state in optimizer.state.values()):
+            for moment in (state[name] for name in ("exp_avg", "exp_avg_sq") if name in state):
+                moment.masked_fill_(moment.abs() < SMALLEST_MOMENT, 0)
 
-    # ---------------------------------------------------------------- logging
-
-    @property
-    def diagnoses_critics(self) -> bool:
-        """Return whether this is an update at which the critics' diagnostics are taken."""
-        return self._n_updates % DIAGNOSTICS_INTERVAL == 1
-
-    @property
-    def diagnoses_units(self) -> bool:
-        """Whether this is an update after which dormant units are counted."""
-        return self._n_updates % UNITS_INTERVAL == 0
-
-    @property
-    def _has_plain_units(self) -> bool:
-        """Whether the networks are linear layers and ReLUs on flat observations: a forward pass changes nothing."""
-        kinds = (nn.Linear, StackedLinear, nn.ReLU, nn.Tanh, nn.Flatten, nn.Sequential, nn.ModuleList, FlattenExtractor)
-        modules = [module for network in (self.actor, self.critic) for module in network.modules()]
-        inner = [module for module in modules if module not in (self.actor, self.critic)]
-        return all(type(module) in kinds for module in inner) and isinstance(self.observation_space, spaces.Box)
-
-    def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
-        """
-        Take the diagnostics of the critics into the log; each is described in docs/tdc.md.
-
-        :param current: (B, C, N)
-        :param target: of the same minibatch
-        """
-        y, mean, std, selected = target
-        td_errors = y.mean(dim=1, keepdim=True) - current.mean(dim=2)  # δ of Fig. S1, (B, C)
-        self.diagnose(
-            critic_loss=quantile_huber_loss(current, y, self.kappa),  # Eq. 10
-            target_mean=y.mean(),
-            target_std=std.gather(1, selected.unsqueeze(1)).mean(),
-            critic_disagreement=(mean.amax(dim=1) - mean.amin(dim=1)).mean(),
-            td_error_var=td_errors.var(dim=0, correction=0).mean(),
-            **{f"critic_{i + 1}_selected": (selected == i).float().mean() for i in range(mean.shape[1])},
-            **describe_selection(target),
-        )
-
-    def diagnose_units(self, replay_data: ReplayBufferSamples) -> None:
-        """
-        Take the shares of dormant units into the log: of the actor, and of the critics at its mean actions.
-
-        :param replay_data: a minibatch, whose observations count
-        """
-        if not self._has_plain_units:
-            return
-        hidden = self.actor.latent_pi if self.stochastic_actor else self.actor.mu
-        observations = replay_data.observations
-        features = self.actor.extract_features(observations, self.actor.features_extractor)  # type: ignore[operator]
-        of_actor, outputs = relu_activations(hidden, features)  # type: ignore[arg-type]
-        actions = self.actor.mu(outputs).tanh() if self.stochastic_actor else outputs  # type: ignore[operator]
-        features = self.critic.extract_features(observations, self.critic.features_extractor)
-        of_critics, _ = relu_activations(self.critic.layers, th.cat([features, actions.detach()], dim=1))
-        if of_actor and of_critics:
-            self.diagnose(actor_dormant=dormant_share(of_actor), critic_dormant=dormant_share(of_critics))
-
-    def _sample_scaled_action(self, learning_starts: int, n_envs: int) -> np.ndarray:
-        fused = self._fused_update
-        if fused is None or self.num_timesteps < learning_starts or not fused.acts():
-            return super()._sample_scaled_action(learning_starts, n_envs)
-        scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
-        return scaled_action.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+    # ---------------------------------------------------------------- learn
 
     def learn(
         self: SelfTDC,
@@ -568,7 +457,45 @@ class TDC(CheckedOffPolicyAlgorithm):
     ) -> SelfTDC:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
 
+    # ---------------------------------------------------------------- logging
+
+    @property
+    def diagnoses_critics(self) -> bool:
+        """Return whether this is an update at which the critics' diagnostics are taken."""
+        return self._n_updates % DIAGNOSTICS_INTERVAL == 1
+
+    @property
+    def diagnoses_units(self) -> bool:
+        """Return whether this is an update after which dormant units are counted."""
+        return self._n_updates % UNITS_INTERVAL == 0
+
+    def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
+        """
+        Take the diagnostics of the critics into the log.
+
+        :param current: (B, C, N)
+        :param target: of the same minibatch
+        """
+        self.diagnose(**describe_critics(current, target, self.kappa))
+
+    def diagnose_units(self, replay_data: ReplayBufferSamples) -> None:
+        """
+        Take the shares of dormant units into the log.
+
+        :param replay_data: a minibatch, whose observations count
+        """
+        self.diagnose(**describe_units(self, replay_data.observations))
+
     # ---------------------------------------------------------------- saving
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        self._renew_temperature()
+        super().save(path, exclude, include)
 
     @classmethod
     def load(
@@ -597,23 +524,13 @@ class TDC(CheckedOffPolicyAlgorithm):
             model._renew_temperature()
         return model
 
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        self._renew_temperature()
-        super().save(path, exclude, include)
-
     def _non_finite_weights(self) -> list[str]:
         temperature_diverged = self.stochastic_actor and not self.current_ent_coef().isfinite()
         return [*super()._non_finite_weights(), *(["ent_coef"] if temperature_diverged else [])]
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "actor_target", "critic", "critic_target"]
-        derived = ["_obstacles", "_fused_update", "_built_ent_coef"]
-        return [*super()._excluded_save_params(), *networks, *derived]
+        return [*super()._excluded_save_params(), *networks, "_built_ent_coef"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer"]
@@ -625,15 +542,5 @@ class TDC(CheckedOffPolicyAlgorithm):
 
 
 def _parameters(networks: tuple[nn.Module, ...]) -> list[th.Tensor]:
-    """The parameters of networks, each once: actor and critics have those of a shared features extractor in common."""
+    """Return the parameters of networks, each once: actor and critics share those of a common features extractor."""
     return list({id(parameter): parameter for network in networks for parameter in network.parameters()}.values())
-
-
-# Methods whose work the fused update does itself
-_FUSED_METHODS = {
-    name: getattr(TDC, name)
-    for name in (
-        *("train", "update", "update_critics", "update_actor", "update_targets"),
-        *("_sample_target_actions", "make_target", "_minimize", "predict"),
-    )
-}

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import nn
 
-from sb3_tdc.common.dormant import dormant_share, relu_activations
 from sb3_tdc.tdc import tdc
+from sb3_tdc.tdc.dormant import dormant_share, relu_activations
 from sb3_tdc.tdc.lam import critical_lam, describe_selection
 from sb3_tdc.tdc.quantiles import Target, select_critic
 from tests.helpers.tdc import HEADS, TwoActions, make

@@ -1,0 +1,88 @@
+"""Which update trains a model and chooses its actions: the readable one, or the fused one where it applies."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
+from sb3_tdc.common.versions import numba_version
+from sb3_tdc.tdc.fused.applicability import obstacles
+from sb3_tdc.tdc.fused.update import FusedUpdate
+
+# Methods whose work the fused update does itself
+_FUSED_METHODS = (
+    *("train", "update", "update_critics", "update_actor", "update_targets"),
+    *("_sample_target_actions", "make_target", "_minimize", "predict"),
+)
+
+
+class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
+    """
+    An algorithm with a readable update, and with the same update on preallocated buffers (:class:`FusedUpdate`).
+
+    The direct subclass, TDC, has the readable update. Where a class below it, or an instance, overrides one of the
+    methods that the fused update does not call, the readable update is used.
+    """
+
+    fused: bool | None
+    # Those of the direct subclass, as they were when it was defined
+    _readable_methods: ClassVar[dict[str, Any]]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if FusedUpdateAlgorithm in cls.__bases__:
+            cls._readable_methods = {name: getattr(cls, name) for name in _FUSED_METHODS}
+
+    def overridden_methods(self) -> list[str]:
+        """Return the methods, replaced on the class or on this instance, that the fused update would not call."""
+        cls, attributes = type(self), vars(self)
+        own = self._readable_methods
+        return [name for name in own if getattr(cls, name) is not own[name] or name in attributes]
+
+    def _setup_fused_update(self) -> None:
+        self._fused_update: FusedUpdate | None = None
+        self._obstacles = obstacles(self)
+        if self._obstacles and self.fused:
+            raise ValueError(self._obstacle_message())
+        if self.verbose > 0 and self.fused is None:
+            self._tell_which_update()
+
+    def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
+        """Return the fused update, bound again if anything has changed, or None where the readable one is used."""
+        bound = self._fused_update
+        if bound is not None and self.fused is not False and bound.fits(batch_size):
+            return bound
+        self._fused_update = None
+        if self.fused is False:
+            return None
+        known, self._obstacles = self._obstacles, obstacles(self)
+        if not self._obstacles:
+            self._fused_update = FusedUpdate(self, batch_size)
+        elif self.fused:
+            raise ValueError(self._obstacle_message())
+        if self.verbose > 0 and known != self._obstacles:
+            self._tell_which_update()
+        return self._fused_update
+
+    def _obstacle_message(self) -> str:
+        return f"fused must be None or False here: {'; '.join(self._obstacles)}"
+
+    def _tell_which_update(self) -> None:
+        update = f"readable update ({'; '.join(self._obstacles)})" if self._obstacles else "fused update"
+        numba = numba_version()
+        loops = f"loops compiled by Numba {numba}" if numba else 'no compiled loops: pip install "sb3-tdc[fast]"'
+        print(f"Using the {update}, {loops}")
+
+    def prepare_to_continue(self) -> None:
+        if self._n_updates > 0:
+            self._bind_fused_update(self.batch_size)  # it also chooses the actions
+
+    def _sample_scaled_action(self, learning_starts: int, n_envs: int) -> np.ndarray:
+        fused = self._fused_update
+        if fused is None or self.num_timesteps < learning_starts or not fused.acts():
+            return super()._sample_scaled_action(learning_starts, n_envs)
+        scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
+        return scaled_action.reshape(-1, *self.action_space.shape)  # type: ignore[misc]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_obstacles", "_fused_update"]
