@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.ablations.calibration import MAX_LAM, CalibratedTDC
 from sb3_tdc.algorithms import ALGORITHMS
+from sb3_tdc.common.off_policy import discounts_of
 from sb3_tdc.common.saved_fields import SavedField, number
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import Target
@@ -27,7 +28,7 @@ class ShiftedTDC(TDC):
 
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
         target = super().make_target(next_quantiles, replay_data, lam)
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        discounts = discounts_of(replay_data, self.gamma)
         std = target.std.gather(1, target.selected.unsqueeze(1))
         lowered = (1 - replay_data.dones) * discounts * lam * std
         self.diagnose(lowered=lowered.mean())
@@ -53,7 +54,7 @@ class PessimisticTDC(CalibratedTDC):
 
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
         target = super().make_target(next_quantiles, replay_data, lam)
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        discounts = discounts_of(replay_data, self.gamma)
         apart = target.mean.amax(dim=1, keepdim=True) - target.mean.amin(dim=1, keepdim=True)
         lowered = (1 - replay_data.dones) * discounts * self.pessimism * apart
         self.diagnose(pessimism=self.pessimism, lowered=lowered.mean())

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
 
 from sb3_tdc.common.checks import (
     OFF_POLICY_LIMITS,
@@ -27,6 +27,16 @@ from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
 
 
+def discounts_of(replay_data: ReplayBufferSamples, gamma: float) -> th.Tensor | float:
+    """
+    Return the discounts of what follows the rewards of a minibatch.
+
+    :param gamma: γ
+    :return: (B, 1) where the minibatch has its own, as that of n-step returns has; otherwise γ
+    """
+    return gamma if replay_data.discounts is None else replay_data.discounts
+
+
 class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     """
     An off-policy algorithm whose arguments are checked, and which neither learns from nor saves what is not finite.
@@ -35,7 +45,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
 
     - in ``limits``, which numbers its arguments may be,
     - in ``schedules``, its arguments that may be schedules,
-    - in ``saved_fields``, what its saved models hold besides SB3's own fields,
+    - in ``saved_fields``, what its saved models hold in addition to SB3's own fields,
     - in ``captured_attributes``, what a resumed run needs of that which saved models leave out,
     - in ``changeable``, its arguments that may be changed when a run is resumed,
     - in ``color``, how figures draw it.
@@ -47,6 +57,21 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     captured_attributes: ClassVar[tuple[str, ...]] = ("_diagnostics",)
     changeable: ClassVar[tuple[str, ...]] = ()
     color: ClassVar[str | None] = None
+
+    # ---------------------------------------------------------------- set-up, replay buffer
+
+    def _setup_model(self) -> None:
+        given, kwargs = self.replay_buffer_class, self.replay_buffer_kwargs
+        self.replay_buffer_kwargs = dict(kwargs)
+        super()._setup_model()
+        # What SB3 chose, with n and γ, is not saved: a model may be loaded with others
+        self._chose_replay_buffer, self.replay_buffer_kwargs = given is None, kwargs
+        self._diagnostics = Diagnostics()
+
+    def _pass_gamma_to_replay_buffer(self) -> None:
+        """Let a replay buffer of n-step returns discount by γ as it is now."""
+        if self._chose_replay_buffer and isinstance(self.replay_buffer, NStepReplayBuffer):
+            self.replay_buffer.gamma = self.gamma
 
     # ---------------------------------------------------------------- arguments
 
@@ -67,7 +92,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
             setattr(self, name, check_within(self.limits, name, getattr(self, name)))
 
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
-        """The current value of one of ``schedules``, checked."""
+        """Return the current value of one of ``schedules``, checked."""
         value = getattr(self, name)
         if name == "learning_rate" and progress_remaining is None:
             value = self._current_lr_schedule()
@@ -78,7 +103,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         return check_number(f"{name} (a schedule, at progress remaining {progress:.4g})", value(progress), 0.0)
 
     def _current_lr_schedule(self) -> Schedule:
-        """SB3's ``lr_schedule``, made anew from ``learning_rate`` where that has been changed since."""
+        """Return SB3's ``lr_schedule``, made again from ``learning_rate`` where that has been changed since."""
         if self.learning_rate is not self._scheduled_learning_rate:
             self.scheduled("learning_rate", progress_remaining=1.0)  # checks it
             self._setup_lr_schedule()
@@ -89,19 +114,6 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         self._scheduled_learning_rate = self.learning_rate
 
     # ---------------------------------------------------------------- logging
-
-    def _setup_model(self) -> None:
-        given, kwargs = self.replay_buffer_class, self.replay_buffer_kwargs
-        self.replay_buffer_kwargs = dict(kwargs)
-        super()._setup_model()
-        # What SB3 chose, with n and γ, is not saved: a model may be loaded with others
-        self._chose_replay_buffer, self.replay_buffer_kwargs = given is None, kwargs
-        self._diagnostics = Diagnostics()
-
-    def _pass_gamma_to_replay_buffer(self) -> None:
-        """Let a replay buffer of n-step returns discount by γ as it is now."""
-        if self._chose_replay_buffer and isinstance(self.replay_buffer, NStepReplayBuffer):
-            self.replay_buffer.gamma = self.gamma
 
     def diagnose(self, **values: th.Tensor | float) -> None:
         """Take scalars of this update into the means of the log; nothing waits for the device."""
@@ -121,21 +133,15 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
 
     @property
     def logger(self) -> Logger:
-        """SB3's logger; what was measured in training is fetched from the device when the logger is read."""
+        """Return SB3's logger; what was measured in training is fetched from the device when the logger is read."""
         if not self._diagnostics.is_recorded:
             self._diagnostics.record(self._logger)
         return self._logger
 
     def dump_logs(self) -> None:
-        """Write log data; the means of the training begin anew."""
+        """Write log data; the means of the training begin again."""
         super().dump_logs()
         self._diagnostics.restart()
-
-    def forget_episodes(self) -> None:
-        """Forget what a subclass knows of the episodes under way: the environments begin new ones."""
-
-    def prepare_to_continue(self) -> None:
-        """Make what a model that has been trained for some time has made, when a run is resumed."""
 
     # ---------------------------------------------------------------- finite guards
 
@@ -161,7 +167,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         return prepared
 
     def _non_finite_weights(self) -> list[str]:
-        """The names of weights that are NaN or infinite."""
+        """Return the names of weights that are NaN or infinite."""
         return find_non_finite(self.policy, self.policy.state_dict())
 
     def save(
@@ -186,3 +192,11 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         chosen = ["replay_buffer_class"] if self._chose_replay_buffer else []
         own = ["_diagnostics", "_scheduled_learning_rate", "_chose_replay_buffer"]
         return [*super()._excluded_save_params(), *own, *chosen]
+
+    # ---------------------------------------------------------------- resuming
+
+    def forget_episodes(self) -> None:
+        """Forget what a subclass knows of the episodes under way: the environments begin new ones."""
+
+    def prepare_to_continue(self) -> None:
+        """Make what a model makes in its first updates, when a run is resumed after them."""

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 
 from sb3_tdc.common.checks import ABOVE_ZERO, OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
-from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
+from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm, discounts_of
 from sb3_tdc.common.saved_fields import SavedField, integer, number
 from sb3_tdc.meow.policies import CnnPolicy, MEOWPolicy, MlpPolicy, MultiInputPolicy
 
@@ -208,8 +208,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         :param ent_coef: α
         :return: (B, 1)
         """
-        # n-step returns carry their own discounts
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        discounts = discounts_of(replay_data, self.gamma)
         next_values = ent_coef * self.network_target.values(replay_data.next_observations)
         next_value = next_values.amin(dim=1, keepdim=True)
         return replay_data.rewards + discounts * (1 - replay_data.dones) * next_value

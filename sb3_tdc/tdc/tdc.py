@@ -25,6 +25,7 @@ from sb3_tdc.common.checks import (
     check_number,
     check_within,
 )
+from sb3_tdc.common.off_policy import discounts_of
 from sb3_tdc.common.saved_fields import SavedField, boolean, integer, none, number, or_none, schedule, text_or_number
 from sb3_tdc.tdc.diagnostics import describe_critics, describe_units
 from sb3_tdc.tdc.fused import FusedUpdateAlgorithm
@@ -356,8 +357,7 @@ class TDC(FusedUpdateAlgorithm):
 
         :param next_quantiles: (B, C, N), of the target critics at (s', ã)
         """
-        # n-step returns carry their own discounts
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        discounts = discounts_of(replay_data, self.gamma)
         return lcb_target(next_quantiles, replay_data.rewards, replay_data.dones, discounts, lam)
 
     def update_actor(self, replay_data: ReplayBufferSamples) -> None:
