@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest, unknown
+from sb3_tdc.common.signatures import constructor_parameters
 
 # What an entry may say besides the keyword arguments of the algorithm, with its type
 _RUN_KEYS: dict[str, Any] = {
@@ -201,18 +202,12 @@ def parse(
 
 
 def constructor_hints(cls: type) -> dict[str, Any]:
-    """Return the annotation of every argument of a constructor, those it passes on by ``**kwargs`` included."""
-    hints: dict[str, Any] = {}
-    for base in cls.__mro__:
-        if "__init__" in vars(base):
-            parameters = inspect.signature(vars(base)["__init__"]).parameters
-            named = {k: p for k, p in parameters.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-            # An annotation that is missing, or a text, allows anything
-            typed = {k: Any if isinstance(p.annotation, str) else p.annotation for k, p in named.items()}
-            hints = {**{k: Any if hint is inspect.Parameter.empty else hint for k, hint in typed.items()}, **hints}
-            if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-                break
-    return hints
+    """Return the annotation of every argument of a constructor, including those it passes on by ``**kwargs``."""
+    hints = {name: parameter.annotation for name, parameter in constructor_parameters(cls).items()}
+    # An annotation that is missing, or a text, allows anything
+    return {
+        name: Any if hint is inspect.Parameter.empty or isinstance(hint, str) else hint for name, hint in hints.items()
+    }
 
 
 def convert_mapping(
@@ -244,7 +239,7 @@ def convert_mapping(
 
 
 def _numbers_in(value: Any) -> Iterator[float]:
-    """Return a number, the number that a schedule begins with, or those in a list or a mapping."""
+    """Yield a number, the number that a schedule begins with, or those in a list or a mapping."""
     if isinstance(value, LinearSchedule):
         yield value(1.0)
     elif isinstance(value, (list, tuple, dict)):

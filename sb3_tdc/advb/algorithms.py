@@ -1,5 +1,6 @@
 """TD3, SAC and TDC with an advisory board. No algorithm changes: only who decides about an action."""
 
+import inspect
 import math
 from typing import Any, ClassVar
 
@@ -12,6 +13,7 @@ from sb3_tdc.advb import policies
 from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_observation_space, check_within
 from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField, integer
+from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.tdc import TDC
 
 
@@ -30,6 +32,13 @@ class Advised(NoisyOffPolicyAlgorithm):
         "formation_period": SavedField(integer(0)),
         "policy_kwargs.n_members": SavedField(integer(1, 256), is_required=False),
     }
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        # What ``help``, and the notebooks that ask for it, show: the arguments of the algorithm, not *args and **kwargs
+        parameters = constructor_parameters(cls)
+        parameters.pop("self")
+        cls.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
 
     def __init__(self, *args: Any, formation_period: int = 10_000, **kwargs: Any):
         self.formation_period = formation_period
@@ -105,7 +114,7 @@ class AdvBTDC(Advised, TDC):
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """
-        TDC's updates; the board then scores with the same λ.
+        Train as TDC does; the board then scores with the same λ.
 
         :param gradient_steps: number of updates
         :param batch_size: B, transitions per update

@@ -1,6 +1,5 @@
 """Folders of runs (RL Zoo's layout) → settings and arrays. Reads only; loads no model, and unpickles nothing."""
 
-import inspect
 import json
 import os
 import re
@@ -17,6 +16,7 @@ import pandas as pd
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.arrays import read_arrays
+from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.envs.simulator import GYMNASIUM
 from sb3_tdc.runs.folder import RunFolder
@@ -247,8 +247,8 @@ def _may_use_mujoco(env_id: str) -> bool:
 
 @cache
 def default_settings(algo: str) -> dict[str, Any]:
-    """The defaults of the algorithm's constructor and of ``sb3-tdc train``."""
-    parameters = inspect.signature(ALGORITHMS[algo]).parameters.values() if algo in ALGORITHMS else ()
+    """Return the defaults of the algorithm's constructor and of ``sb3-tdc train``."""
+    parameters = constructor_parameters(ALGORITHMS[algo]).values() if algo in ALGORITHMS else ()
     return {**{p.name: p.default for p in parameters if p.default is not p.empty}, **_SETTINGS}
 
 

@@ -219,10 +219,10 @@ class MEOW(CheckedOffPolicyAlgorithm):
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str = "MEOW",
-        *args: Any,
-        **kwargs: Any,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
     ) -> SelfMEOW:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "network", "network_target"]

@@ -452,10 +452,10 @@ class TDC(FusedUpdateAlgorithm):
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str = "TDC",
-        *args: Any,
-        **kwargs: Any,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
     ) -> SelfTDC:
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, *args, **kwargs)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     # ---------------------------------------------------------------- logging
 
@@ -504,12 +504,19 @@ class TDC(FusedUpdateAlgorithm):
         env: GymEnv | None = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
-        *args: Any,
+        print_system_info: bool = False,
+        force_reset: bool = True,
         **kwargs: Any,
     ) -> SelfTDC:
         """
         Load the model from a zip-file, as SB3 does.
 
+        :param path: path to the file (or a file-like) to load from
+        :param env: the environment to train on; None if only predictions are needed
+        :param device: device on which the code should run
+        :param custom_objects: objects that replace those in the file, by name
+        :param print_system_info: whether to print the system of the saved model, and this one
+        :param force_reset: whether to reset the environment before training
         :param kwargs: attributes to set over the file's; another ``ent_coef`` than the file's also replaces its
             temperature
         """
@@ -518,7 +525,7 @@ class TDC(FusedUpdateAlgorithm):
             {name: value for name, value in objects.items() if name != "ent_coef"}
             for objects in (custom_objects or {}, kwargs)
         )
-        model = super().load(path, env, device, custom_objects, *args, **kwargs)
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         if "ent_coef" in given:
             model.ent_coef = given["ent_coef"]
             model._renew_temperature()

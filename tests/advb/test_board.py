@@ -1,5 +1,7 @@
 """Who sits on a board, what it does, and that it comes back with a model."""
 
+import inspect
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -309,3 +311,10 @@ def test_the_board_is_not_worse_than_its_best_member_by_far_on_pendulum():
     model.learn(6_000, callback=BoardCallback(make_vec_env("Pendulum-v1", 1, seed=1)))
     mean, _ = evaluate_policy(model, env, n_eval_episodes=10, warn=False)
     assert mean > -400
+
+
+@ALGORITHMS
+def test_help_shows_the_arguments_of_the_algorithm(algorithm):
+    parameters = list(inspect.signature(algorithm).parameters)
+    base = algorithm.__bases__[1]  # the first is the board
+    assert parameters == [*inspect.signature(base).parameters, "formation_period"]

@@ -1,13 +1,16 @@
 """Folders of runs → settings and arrays."""
 
+import inspect
 import shutil
 
 import numpy as np
 import pytest
+from stable_baselines3 import SAC, TD3
 
+from sb3_tdc import TDC
 from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import group_runs
-from sb3_tdc.experiments.results import Run, find_runs
+from sb3_tdc.experiments.results import Run, default_settings, find_runs
 from tests.helpers.run_folders import make_run
 from tests.safe_load.attacks.tools import rewrite
 
@@ -109,3 +112,11 @@ def test_of_several_folders_the_last_counts(tmp_path):
     assert group.final_returns.tolist() == [2, 3]
     with pytest.raises(ValueError, match=r"There are no runs in .*nothing"):
         find_runs(tmp_path / "results", tmp_path / "nothing")
+
+
+@pytest.mark.parametrize(("algo", "base"), [("advb_td3", TD3), ("advb_sac", SAC), ("tdc", TDC)])
+def test_defaults_are_known_that_a_constructor_passes_on(algo, base):
+    defaults = default_settings(algo)
+    for name in ("learning_rate", "batch_size", "tau"):
+        assert defaults[name] == inspect.signature(base).parameters[name].default, name
+    assert defaults.get("formation_period") == (10_000 if "advb" in algo else None)
