@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
-    from sb3_tdc.common.diagnostics import NonFiniteError
+    from sb3_tdc.common.finite import NonFiniteError
     from sb3_tdc.meow import MEOW
     from sb3_tdc.resume import ResumeStates
     from sb3_tdc.safe_load import UnsafeFileError, load_safely
@@ -19,7 +19,7 @@ _MODULES = {
     "AdvBSAC": "advb",
     "AdvBTD3": "advb",
     "AdvBTDC": "advb",
-    "NonFiniteError": "common.diagnostics",
+    "NonFiniteError": "common.finite",
     "ResumeStates": "resume",
     "UnsafeFileError": "safe_load",
     "load_safely": "safe_load",

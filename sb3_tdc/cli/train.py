@@ -8,7 +8,7 @@ from datetime import timedelta
 from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser, add_settings, warn_about_trust
 from sb3_tdc.common.commands import command
-from sb3_tdc.common.diagnostics import NonFiniteError
+from sb3_tdc.common.finite import NonFiniteError
 from sb3_tdc.common.output import harmless_output, warnings_as_sentences
 from sb3_tdc.resume import LockedError, NotRestoredError, stored_steps
 from sb3_tdc.runs.folder import RunFolder

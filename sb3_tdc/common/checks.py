@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from torch import nn
 
 # The smallest and the largest number that an argument may be; integers where the smallest is an int
 Limits = Mapping[str, tuple[float, float]]
@@ -99,24 +98,11 @@ def check_boolean(name: str, value: Any, or_none: bool = False) -> bool | None:
     raise ValueError(f"{name} must be True{', False or None' if or_none else ' or False'}, got {value!r}")
 
 
-def find_non_finite(network: nn.Module, weights: dict[str, Any]) -> list[str]:
-    """
-    Look at parameters and running statistics; a constant, for instance the mask of an attention, may be infinite.
-
-    :param network: whose weights they are; its own are not looked at
-    :param weights: a state dict
-    :return: the names of those that are NaN or infinite
-    """
-    parameters = {name for name, _ in network.named_parameters(remove_duplicate=False)}
-    checked = (name for name in weights if name in parameters or "running_" in name)
-    return [name for name in checked if not weights[name].isfinite().all()]
-
-
 def check_action_space(action_space: spaces.Space) -> None:
     """
-    Check that TDC can act in a space.
+    Check that an action space is a bounded ``Box`` of floats.
 
-    :raises ValueError: unless the actions are a bounded ``Box`` of floating-point numbers
+    :raises ValueError: if it is anything else
     """
     if not isinstance(action_space, spaces.Box):
         raise ValueError(f"env must have a Box action space (continuous actions), got {action_space}")

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 import torch as th
 from stable_baselines3.common.logger import Logger
 
+from sb3_tdc.common.finite import ADVICE, NonFiniteError
+
 # Pending scalars are fetched when there are this many, so that a run that never logs still notices a NaN
 _MAX_PENDING = 1000
-
-
-class NonFiniteError(FloatingPointError):
-    """A loss, an action, a reward or a weight is NaN or infinite; the message says which and since when."""
 
 
 class Diagnostics:
@@ -26,7 +24,7 @@ class Diagnostics:
         self._sums: dict[str, float] = {}
         self._counts: dict[str, int] = {}
         self._last_finite: dict[str, int] = {}
-        self._ended: list[str] = []  # means that begin anew with the next value
+        self._ended: list[str] = []  # means that begin again with the next value
         self.is_recorded = True
 
     def add(self, update: int, timestep: int, values: Mapping[str, th.Tensor | float]) -> None:
@@ -53,7 +51,7 @@ class Diagnostics:
         return {name: self._sums[name] / self._counts[name] for name in self._sums}
 
     def restart(self) -> None:
-        """Begin every mean anew."""
+        """Begin every mean again."""
         self._collect()
         self._ended = list(self._sums)
 
@@ -78,10 +76,8 @@ class Diagnostics:
             if not math.isfinite(number):
                 last = self._last_finite.get(name)
                 before = f"it was last seen finite at update {last}" if last is not None else "it was never seen finite"
-                raise NonFiniteError(
-                    f"{name} is {number} since update {update} (timestep {timestep}); {before}. Training has "
-                    "stopped. Look for extreme rewards or observations, or lower the learning rates."
-                )
+                since = f"since update {update} (timestep {timestep})"
+                raise NonFiniteError(f"{name} is {number} {since}; {before}. {ADVICE}")
             self._last_finite[name] = update
             if name in self._ended:
                 self._ended.remove(name)

@@ -19,9 +19,9 @@ from sb3_tdc.common.checks import (
     check_number,
     check_observation_space,
     check_within,
-    find_non_finite,
 )
-from sb3_tdc.common.diagnostics import Diagnostics, NonFiniteError
+from sb3_tdc.common.diagnostics import Diagnostics
+from sb3_tdc.common.finite import NonFiniteError, find_non_finite_weights, refuse_to_save
 from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
@@ -168,7 +168,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
 
     def _non_finite_weights(self) -> list[str]:
         """Return the names of weights that are NaN or infinite."""
-        return find_non_finite(self.policy, self.policy.state_dict())
+        return find_non_finite_weights(self)
 
     def save(
         self,
@@ -184,8 +184,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         :param include: name of parameters that might be excluded but should be included anyway
         :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
         """
-        if broken := self._non_finite_weights():
-            raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
+        refuse_to_save(self, self._non_finite_weights())
         super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_tdc.common.diagnostics import NonFiniteError
+from sb3_tdc.common.finite import NonFiniteError
 
 _LARGEST = float(np.finfo(np.float32).max)  # rewards and actions are stored, and networks compute, in float32
 

@@ -17,3 +17,9 @@ def counted(numbers: Sequence[int], noun: str) -> str:
 def listed(words: Sequence[str]) -> str:
     """``["a", "b", "c"]`` → "a, b and c"."""
     return ", ".join(words[:-1]) + " and " + words[-1] if len(words) > 1 else "".join(words)
+
+
+def first_of(names: Sequence[str], n: int = 3) -> str:
+    """``first_of(["a", "b", "c", "d", "e"])`` → "a, b, c and 2 others"."""
+    others = [count(len(names) - n, "other")] if len(names) > n else []
+    return " and ".join([", ".join(names[:n]), *others])

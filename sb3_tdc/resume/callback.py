@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
-from sb3_tdc.common.diagnostics import NonFiniteError
+from sb3_tdc.common.files import write_atomically
+from sb3_tdc.common.finite import refuse_non_finite
 from sb3_tdc.common.words import count
 from sb3_tdc.resume import replay_file, run_state
 from sb3_tdc.resume.locations import Locations
@@ -243,12 +245,13 @@ class ResumeStates(BaseCallback):
     def _write(self, step: int) -> None:
         model: Any = self.model
         assert self._initial is not None
-        _refuse_non_finite(step, run_state.find_non_finite(model))
+        refusal = f"The state of step {step:,} was not written:"
+        refuse_non_finite(refusal, run_state.find_non_finite(model))
         parts, context = run_state.capture_state(model, self.root, self._initial)
         self._tell(context.left_out)
         if not self.store.open_again(self._digests):
             self._segments, self._digests, self._before, self._kept = [], {}, None, {}
-        segments, digests = self._write_segment(step)
+        segments, digests = self._write_segment(step, refusal)
         files = [*self.files, *run_state.files_of_evaluations(self.root)]
         content = {
             "run": run_state.describe_run(model),
@@ -274,7 +277,7 @@ class ResumeStates(BaseCallback):
         self._kept = {file: (stats[file], stored.path / f"file_{i}") for i, file in enumerate(files) if file in stats}
         self.store.remove_old()
 
-    def _write_segment(self, step: int) -> tuple[list[replay_file.Segment], dict[str, str]]:
+    def _write_segment(self, step: int, refusal: str) -> tuple[list[replay_file.Segment], dict[str, str]]:
         model: Any = self.model
         buffer = model.replay_buffer
         segments = self._segments
@@ -282,7 +285,7 @@ class ResumeStates(BaseCallback):
         new = replay_file.new_segment(buffer, f"step_{step:012d}.npz", first, (step - last_step) // model.n_envs)
         if new is None:
             return segments, self._digests
-        _refuse_non_finite(step, replay_file.find_non_finite(buffer, new))
+        refuse_non_finite(refusal, replay_file.find_non_finite(buffer, new))
         infos, left_out = replay_file.capture_infos(buffer, new)
         self._tell(left_out)
         digest = self.store.write_shared(new.name, replay_file.write_segment(buffer, new, infos))
@@ -314,9 +317,7 @@ class ResumeStates(BaseCallback):
             if number is None:
                 file.unlink(missing_ok=True)
             else:
-                part = file.with_name(f".{file.name}.part")
-                shutil.copyfile(stored.path / f"file_{number}", part)
-                os.replace(part, file)
+                write_atomically(partial(shutil.copyfile, stored.path / f"file_{number}"), file)
 
     def _on_step(self) -> bool:
         return True
@@ -333,15 +334,6 @@ def _without_repetition(sentences: Iterable[str]) -> list[str]:
         f"{place} (and {count(len(others), 'other')}){what}" if others else f"{place}{what}"
         for what, (place, *others) in places.items()
     ]
-
-
-def _refuse_non_finite(step: int, names: list[str]) -> None:
-    if names:
-        more = f" and {count(len(names) - 3, 'other')}" if len(names) > 3 else ""
-        raise NonFiniteError(
-            f"The state of step {step:,} was not written: {', '.join(names[:3])}{more} are not finite. "
-            "Training has stopped; those before stay."
-        )
 
 
 def _save_weights(weights: dict[str, Any], path: Path) -> None:

@@ -20,7 +20,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_tdc.common.checks import find_non_finite as find_non_finite_weights
+from sb3_tdc.common.finite import find_non_finite_weights
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.versions import library_versions
 from sb3_tdc.resume import kinds  # noqa: F401  # the table that all of this goes by
@@ -214,9 +214,9 @@ def restore_weights(model: OffPolicyAlgorithm, weights: dict[str, Any]) -> None:
 
 def find_non_finite(model: OffPolicyAlgorithm) -> list[str]:
     """Return the names of weights, moments of optimizers and running statistics that are NaN or infinite."""
-    broken = find_non_finite_weights(model.policy, model.policy.state_dict())
-    state_dicts, tensors = model._get_torch_save_params()
-    numbers: dict[str, Any] = {name: recursive_getattr(model, name).detach() for name in tensors}
+    broken = find_non_finite_weights(model)
+    state_dicts, _ = model._get_torch_save_params()
+    numbers: dict[str, Any] = {}
     for name in state_dicts:
         optimizer = recursive_getattr(model, name)
         if isinstance(optimizer, th.optim.Optimizer):

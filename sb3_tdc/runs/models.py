@@ -22,7 +22,7 @@ from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
 from sb3_tdc.common.words import count
 from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
-from sb3_tdc.runs.callbacks.finite_guard import check_weights
+from sb3_tdc.runs.callbacks.finite_guard import check_before_saving
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, read_data
 from sb3_tdc.safe_load.fields import on_the_command_line
@@ -156,7 +156,7 @@ def save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
 
     :raises NonFiniteError: if a weight is NaN or infinite
     """
-    check_weights(model, path)
+    check_before_saving(model)
     write_atomically(model.save, path)
     normalization = model.get_vec_normalize_env()
     if normalization is not None:

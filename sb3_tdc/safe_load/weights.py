@@ -13,7 +13,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from sb3_tdc.common.checks import find_non_finite
+from sb3_tdc.common.finite import find_non_finite
 from sb3_tdc.common.untrusted import escaped, shown
 from sb3_tdc.safe_load.archives import read_archive
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError

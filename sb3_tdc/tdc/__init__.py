@@ -1,4 +1,4 @@
-from sb3_tdc.common.diagnostics import NonFiniteError
+from sb3_tdc.common.finite import NonFiniteError
 from sb3_tdc.tdc.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_tdc.tdc.tdc import TDC
 

@@ -532,7 +532,8 @@ class TDC(FusedUpdateAlgorithm):
         return model
 
     def _non_finite_weights(self) -> list[str]:
-        temperature_diverged = self.stochastic_actor and not self.current_ent_coef().isfinite()
+        # α may be infinite where log α is not
+        temperature_diverged = self._learns_ent_coef and not self.current_ent_coef().isfinite()
         return [*super()._non_finite_weights(), *(["ent_coef"] if temperature_diverged else [])]
 
     def _excluded_save_params(self) -> list[str]:

@@ -1,6 +1,6 @@
 """Numbers and lists in sentences."""
 
-from sb3_tdc.common.words import count, counted, listed
+from sb3_tdc.common.words import count, counted, first_of, listed
 
 
 def test_one_is_no_plural():
@@ -18,3 +18,12 @@ def test_several_numbers():
 
 def test_lists():
     assert [listed(list("abc"[:n])) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+
+
+def test_the_first_of_many():
+    assert [first_of(list("abcde"[:n])) for n in (1, 3, 4, 5)] == [
+        "a",
+        "a, b, c",
+        "a, b, c and 1 other",
+        "a, b, c and 2 others",
+    ]

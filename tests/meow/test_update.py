@@ -199,7 +199,7 @@ def test_a_loss_that_is_not_finite_ends_training_and_is_not_saved(tmp_path):
     model.set_logger(configure(None, []))
     with pytest.raises(NonFiniteError, match="loss is inf since update 1"):
         train(model, [batch])
-    with pytest.raises(NonFiniteError, match="was not written"):
+    with pytest.raises(NonFiniteError, match="was not saved"):
         model.save(tmp_path / "model.zip")
     assert not (tmp_path / "model.zip").exists()
 

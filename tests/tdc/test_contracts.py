@@ -26,7 +26,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn
 
 from sb3_tdc import MEOW, TDC, NonFiniteError, load_safely
-from sb3_tdc.common.checks import find_non_finite
+from sb3_tdc.common.finite import find_non_finite
 from sb3_tdc.safe_load import UnsafeFileError
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
 from tests.helpers.tdc import TwoActions
@@ -328,7 +328,7 @@ def test_an_infinite_constant_is_saved_and_loaded(tmp_path, shared):
     for name in ("norm.weight", "norm.running_mean", "norm.running_var"):
         with th.no_grad():
             model.actor.features_extractor.state_dict()[name][1] = th.nan
-        with pytest.raises(NonFiniteError, match=rf"model.zip was not written: .*features_extractor.{name}"):
+        with pytest.raises(NonFiniteError, match=rf"model of step 40 was not saved: .*features_extractor.{name}"):
             model.save(tmp_path / "model.zip")
         unsafe = tmp_path / "unsafe.zip"
         OffPolicyAlgorithm.save(model, unsafe)

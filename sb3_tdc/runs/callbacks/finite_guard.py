@@ -2,16 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_tdc.common.checks import find_non_finite
+from sb3_tdc.common.finite import ADVICE, NonFiniteError, find_non_finite_weights, refuse_to_save
+from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.transitions import check_first_observation, check_transition
-from sb3_tdc.common.words import count
-from sb3_tdc.tdc import NonFiniteError
+from sb3_tdc.common.words import first_of
 
 
 class FiniteGuard(BaseCallback):
@@ -29,14 +27,14 @@ class FiniteGuard(BaseCallback):
         return True
 
 
-def check_weights(model: BaseAlgorithm, path: Path) -> None:
+def check_before_saving(model: BaseAlgorithm) -> None:
     """
-    Look at what is about to be saved.
+    Check the weights of a model whose ``save`` does not check them.
 
     :raises NonFiniteError: if a weight is NaN or infinite
     """
-    if broken := _non_finite_weights(model):
-        raise NonFiniteError(f"{path} was not written: the weights {', '.join(broken)} are not finite.")
+    if not isinstance(model, CheckedOffPolicyAlgorithm):
+        refuse_to_save(model, find_non_finite_weights(model))
 
 
 @contextmanager
@@ -51,16 +49,7 @@ def divergence_named(model: BaseAlgorithm) -> Iterator[None]:
     except NonFiniteError:
         raise
     except Exception as error:
-        if broken := _non_finite_weights(model):
-            raise NonFiniteError(
-                f"The weights {', '.join(broken)} are not finite at timestep {model.num_timesteps}. Training has "
-                "stopped. Look for extreme rewards or observations, or lower the learning rates."
-            ) from error
+        if broken := find_non_finite_weights(model):
+            when = f"at timestep {model.num_timesteps}"
+            raise NonFiniteError(f"The weights {first_of(broken)} are not finite {when}. {ADVICE}") from error
         raise
-
-
-def _non_finite_weights(model: BaseAlgorithm) -> list[str]:
-    _, names = model._get_torch_save_params()
-    broken = find_non_finite(model.policy, model.policy.state_dict())
-    broken += [name for name in names if not th.as_tensor(getattr(model, name)).isfinite().all()]
-    return broken if len(broken) <= 3 else [*broken[:3], f"and {count(len(broken) - 3, 'other')}"]

@@ -1,11 +1,10 @@
 """Models saved during training. A full disk does not end training."""
 
 import warnings
-from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
-from sb3_tdc.runs.callbacks.finite_guard import check_weights
+from sb3_tdc.runs.callbacks.finite_guard import check_before_saving
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import DISK_ERRORS, save_model
 
@@ -30,7 +29,7 @@ class SavePeriodically(CheckpointCallback):
 
     def _on_step(self) -> bool:
         if self.n_calls % self.save_freq == 0:
-            check_weights(self.model, Path(self._checkpoint_path(extension="zip")))
+            check_before_saving(self.model)
         try:
             return super()._on_step()
         except DISK_ERRORS as error:
