@@ -28,7 +28,7 @@ from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest, unknown
 from sb3_tdc.common.signatures import constructor_parameters
 
-# What an entry may say besides the keyword arguments of the algorithm, with its type
+# What an entry may say in addition to the keyword arguments of the algorithm, with its type
 _RUN_KEYS: dict[str, Any] = {
     "n_timesteps": int,
     "n_envs": int,

@@ -49,7 +49,7 @@ class PessimisticTDC(CalibratedTDC):
 
     @property
     def pessimism(self) -> float:
-        """β"""
+        """Return β."""
         return max(-self.calibrated, 0.0)
 
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:

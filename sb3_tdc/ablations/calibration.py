@@ -4,7 +4,6 @@ TDC that calibrates λ by comparing the returns of training episodes with the fi
 After ACC (Dorka et al. 2021); docs/lambda.md has the equations, and what was found.
 """
 
-import copy
 import math
 from typing import Any, ClassVar
 
@@ -13,9 +12,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc.common.checks import Limits
-from sb3_tdc.common.returns import discounted_returns
 from sb3_tdc.common.saved_fields import SavedField, number
-from sb3_tdc.critics.episodes import predict_quantiles
+from sb3_tdc.critics.episodes import EVERY, Steps, predict_quantiles
+from sb3_tdc.critics.returns import discounted_returns
 from sb3_tdc.tdc import TDC
 
 # The largest λ of a calibration: beyond, the wider critic is selected nearly everywhere
@@ -26,8 +25,6 @@ RATE = 0.1
 SCALE_WEIGHT = 0.05
 # The least number of steps of ended episodes, and of updates, between two changes of λ
 PERIOD = 1_000
-# Steps of an episode between those whose values are predicted: neighbouring steps say much the same
-EVERY = 10
 # At most this many environments are followed
 MAX_FOLLOWED = 16
 # The longest horizon, 1/(1 − γ), for which a calibration waits in the beginning
@@ -64,37 +61,6 @@ def updates_before(tau: float, gamma: float) -> float:
     return horizon / tau if tau > 0 else math.inf
 
 
-class PendingEpisode:
-    """The rewards of an episode under way, and every ``EVERY``-th observation and action."""
-
-    def __init__(self) -> None:
-        self.rewards: list[float] = []
-        self.observations: list[Any] = []
-        self.actions: list[np.ndarray] = []
-
-    def add(self, observation: Any, action: np.ndarray, reward: float) -> None:
-        """
-        Add a step.
-
-        :param observation: as the policy saw it, without a batch axis
-        :param action: in [-1, 1]
-        :param reward: as the environment gave it
-        """
-        if len(self.rewards) % EVERY == 0:
-            self.observations.append(copy.deepcopy(observation))
-            self.actions.append(action.copy())
-        self.rewards.append(reward)
-
-    def returns(self, rewards: np.ndarray, gamma: float, following: float) -> np.ndarray:
-        """
-        Return the discounted returns of the steps that were looked at.
-
-        :param rewards: those of the episode, in the critics' units
-        :param following: the value of what comes after the last step; 0 where the episode ended by itself
-        """
-        return discounted_returns(rewards, gamma, following)[::EVERY]
-
-
 class Calibration:
     """
     The episodes under way, and the errors of the ended ones since λ was changed.
@@ -104,7 +70,7 @@ class Calibration:
     """
 
     def __init__(self, n_updates: int = 0) -> None:
-        self.episodes: dict[int, PendingEpisode] = {}
+        self.episodes: dict[int, Steps] = {}
         self.errors: list[np.ndarray] = []
         self.n_steps = 0
         self.last_update = n_updates
@@ -113,7 +79,7 @@ class Calibration:
     def begin_episodes(self, n_envs: int) -> None:
         """Forget the episodes under way. Of many environments, which may explore differently, some are followed."""
         followed = np.linspace(0, n_envs - 1, min(n_envs, MAX_FOLLOWED)).round().astype(int)
-        self.episodes = {int(i): PendingEpisode() for i in followed}
+        self.episodes = {int(i): Steps(EVERY) for i in followed}
 
     def end_episode(self, env: int, errors: np.ndarray | None) -> None:
         """
@@ -124,7 +90,7 @@ class Calibration:
         if errors is not None:
             self.errors.append(errors)
             self.n_steps += len(self.episodes[env].rewards)
-        self.episodes[env] = PendingEpisode()
+        self.episodes[env] = Steps(EVERY)
 
     def take_errors(self, n_updates: int) -> np.ndarray | None:
         """
@@ -143,7 +109,7 @@ class CalibratedTDC(TDC):
     """
     TDC whose λ begins at ``lam``, rises after underestimation and falls after overestimation.
 
-    Another ``lam`` than the one that the calibration began at begins it anew.
+    Another ``lam`` than the one that the calibration began at starts it again.
 
     :param args: those of TDC
     :param kwargs: those of TDC; ``lam`` is a number from 0 to 10
@@ -174,12 +140,12 @@ class CalibratedTDC(TDC):
 
     @property
     def calibrated(self) -> float:
-        """The calibrated number: λ where it is not negative."""
+        """Return the calibrated number: λ where it is not negative."""
         return self._calibrated if self._calibrated_from == self.lam else float(self.lam)  # type: ignore[arg-type]
 
     @property
     def error_scale(self) -> float:
-        """The moving average of |G − Q₁|; 0 before the first errors."""
+        """Return the moving average of |G − Q₁|; 0 before the first errors."""
         return self._error_scale if self._calibrated_from == self.lam else 0.0
 
     def scheduled(self, name: str, progress_remaining: float | None = None) -> float:
@@ -230,7 +196,7 @@ class CalibratedTDC(TDC):
         if errors is not None:
             self._calibrate(errors)
 
-    def _prediction_errors(self, episode: PendingEpisode, info: dict[str, Any]) -> np.ndarray:
+    def _prediction_errors(self, episode: Steps, info: dict[str, Any]) -> np.ndarray:
         """Return G − Q₁ at steps of an ended episode; what comes after a time limit is in G as Q₁ has it."""
         rewards = np.asarray(episode.rewards)
         if self._vec_normalize_env is not None:  # as the critics learn them
@@ -240,12 +206,12 @@ class CalibratedTDC(TDC):
             last = info["terminal_observation"]
             action, _ = self.predict(last, deterministic=True)
             following = float(self._first_values([last], action[None])[0])
-        returns = episode.returns(rewards, self.gamma, following)
+        returns = discounted_returns(rewards, self.gamma, following)[:: episode.every]
         actions = self.policy.unscale_action(np.stack(episode.actions))
         return returns - self._first_values(episode.observations, actions)
 
     def _first_values(self, observations: list[Any], actions: np.ndarray) -> np.ndarray:
-        """Q₁ (T,) of observations as the policy saw them, and actions as given to the environment."""
+        """Return Q₁ (T,) of observations as the policy saw them, and actions as given to the environment."""
         return predict_quantiles(self, observations, actions)[:, 0].mean(dim=1).numpy()
 
     def _calibrate(self, errors: np.ndarray) -> None:

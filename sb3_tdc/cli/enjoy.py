@@ -19,11 +19,11 @@ from sb3_tdc.advb.policies import AdvisedPolicy
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
 from sb3_tdc.common.files import check_writable
-from sb3_tdc.common.returns import steps_until_negligible
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.common.words import count
 from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
+from sb3_tdc.critics.returns import steps_until_negligible
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.registry import import_packages, is_of_mujoco, split_env_id
 from sb3_tdc.envs.rendering import (

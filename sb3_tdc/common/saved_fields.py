@@ -25,7 +25,7 @@ class SavedField(NamedTuple):
 
 
 def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
-    """Return a check of a field, as :func:`boolean` is one."""
+    """Return a check that accepts integers in a range."""
 
     def check(name: str, value: Any) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
@@ -38,7 +38,7 @@ def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
 def number(
     minimum: float = -math.inf, maximum: float = math.inf, above: float = -math.inf
 ) -> Callable[[str, Any], float]:
-    """Return a check of a field: a finite number in a range, which does not hold ``above``."""
+    """Return a check that accepts finite numbers in a range, and above ``above``."""
 
     def check(name: str, value: Any) -> float:
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
@@ -53,10 +53,10 @@ def number(
 
 def boolean(name: str, value: Any) -> bool:
     """
-    A check of a field.
+    Take True or False alone.
 
     :return: the value
-    :raises ValueError: unless it is True or False
+    :raises ValueError: if it is anything else
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be true or false, got {shown(value)}")

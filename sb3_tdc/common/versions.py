@@ -1,4 +1,4 @@
-"""What a result depends on besides its seed: versions, the commit, the processor."""
+"""What a result depends on in addition to its seed: versions, the commit, the processor."""
 
 import platform
 import re

@@ -5,6 +5,7 @@ Shapes: ``T`` steps of an episode, ``C`` critics, ``N`` quantiles. Predictions a
 mean action that is played.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -13,14 +14,16 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_tdc.common.returns import discounted_returns, known_steps
+from sb3_tdc.critics.returns import discounted_returns, known_steps
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import mean_and_std, quantile_midpoints, select_critic
 
 
 def observed_frequency(quantiles: np.ndarray, returns: np.ndarray) -> np.ndarray:
     """
-    How often the return stayed at or below each predicted quantile: of a calibrated critic, as often as its level says.
+    Return how often the return stayed at or below each predicted quantile.
+
+    Of a calibrated critic, that is as often as the quantile's level says.
 
     :param quantiles: (T, N)
     :param returns: (T,)
@@ -47,22 +50,22 @@ class Episode:
 
     @property
     def means(self) -> np.ndarray:
-        """(M, C)"""
+        """Return (M, C), predicted means."""
         return self.quantiles.mean(axis=2)
 
     @property
     def stds(self) -> np.ndarray:
-        """(M, C), population standard deviations (Eq. 4)"""
+        """Return (M, C), population standard deviations (Eq. 4)."""
         return self.quantiles.std(axis=2)
 
     @property
     def overestimation(self) -> np.ndarray:
-        """(M, C), predicted mean − realised return; NaN where that is not known"""
+        """Return (M, C), predicted mean − realised return; NaN where that is not known."""
         return self.means - self.returns[:, None]
 
     @property
     def frequencies(self) -> np.ndarray:
-        """(C, N), see :func:`observed_frequency`; NaN if no return is known"""
+        """Return (C, N), see :func:`observed_frequency`; NaN if no return is known."""
         known = np.isfinite(self.returns)
         if not known.any():
             return np.full(self.quantiles.shape[1:], np.nan)
@@ -138,20 +141,19 @@ def spread_and_errors(pooled: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return pooled.stds, np.abs(pooled.overestimation), np.abs(returns - slope * means)
 
 
-class Recording:
-    """
-    Collects the steps of an episode, and at its end asks the critics about them all at once.
+# The distance of the steps that critics are asked about: neighbouring steps say much the same
+EVERY = 10
 
-    :param model: its critics, γ and λ
-    :param every: distance of the steps to look at, at least 1; the rewards of all steps count
-    :param normalization: what turns the rewards into those that the critics were trained on, if they are not yet
-    :param time_limit: of the task, if play does not go on after it (:func:`~sb3_tdc.common.returns.known_steps`)
+
+class Steps:
+    """
+    The rewards of an episode under way, and every few observations and actions.
+
+    :param every: the distance of the steps whose observations and actions are kept, at least 1
     """
 
-    def __init__(
-        self, model: TDC, every: int = 1, normalization: VecNormalize | None = None, time_limit: int | None = None
-    ):
-        self.model, self.every, self.normalization, self.time_limit = model, every, normalization, time_limit
+    def __init__(self, every: int = 1):
+        self.every = every
         self.start()
 
     def start(self) -> None:
@@ -162,16 +164,33 @@ class Recording:
 
     def add(self, observation: Any, action: np.ndarray, reward: float) -> None:
         """
-        Record one step.
+        Add a step.
 
         :param observation: without a batch axis, as the policy saw it
         :param action: (A,)
         :param reward: as the environment gave it
         """
         if len(self.rewards) % self.every == 0:
-            self.observations.append(observation)
-            self.actions.append(action)
+            self.observations.append(copy.deepcopy(observation))
+            self.actions.append(action.copy())
         self.rewards.append(reward)
+
+
+class Recording(Steps):
+    """
+    Collects the steps of an episode, and at its end asks the critics about them all at once.
+
+    :param model: its critics, γ and λ
+    :param every: distance of the steps to look at, at least 1; the rewards of all steps count
+    :param normalization: what turns the rewards into those that the critics were trained on, if they are not yet
+    :param time_limit: of the task, if play does not continue after it (:func:`~sb3_tdc.critics.returns.known_steps`)
+    """
+
+    def __init__(
+        self, model: TDC, every: int = 1, normalization: VecNormalize | None = None, time_limit: int | None = None
+    ):
+        super().__init__(every)
+        self.model, self.normalization, self.time_limit = model, normalization, time_limit
 
     def finish(self, terminated: bool, n_shown: int | None = None) -> Episode:
         """

@@ -9,9 +9,9 @@ import numpy as np
 import torch as th
 
 from sb3_tdc.common.plots import import_figure, style_axes
-from sb3_tdc.common.returns import TOLERANCE
 from sb3_tdc.common.words import count
 from sb3_tdc.critics.episodes import Episode, pool, rank_correlation, spread_and_errors, summarise
+from sb3_tdc.critics.returns import TOLERANCE
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.lam import critical_lam
 from sb3_tdc.tdc.quantiles import quantile_midpoints

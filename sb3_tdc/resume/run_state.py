@@ -23,7 +23,6 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_tdc.common.finite import find_non_finite_weights
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.versions import library_versions
-from sb3_tdc.resume import kinds  # noqa: F401  # the table that all of this goes by
 from sb3_tdc.resume.compare import differences
 from sb3_tdc.resume.kinds.table import KINDS
 from sb3_tdc.resume.locations import UNMOVED, Locations

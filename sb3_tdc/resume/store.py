@@ -72,7 +72,7 @@ class Store:
 
     :param folder: made if it is missing
     :param keep: how many of the newest stay
-    :param span: besides, one stays that is at least this many steps older than the newest, and less than twice as many
+    :param span: one more stays, which is at least this many steps older than the newest, and less than twice as many
         as soon as there can be one; 0 for none
     :raises LockedError: if another process writes there
     """

@@ -1,7 +1,7 @@
 """
 The state of Python objects as JSON and arrays, and back into objects that are there already. Nothing is pickled.
 
-``capture`` walks an object graph; ``restore`` walks the same graph, built anew, and gives it the values. What can hold
+``capture`` walks an object graph; ``restore`` walks the same graph, built again, and gives it the values. What can hold
 a state that Python does not see (a native object, a lock, a socket) is refused by its path: an object is captured
 whole, or not at all. Some values are made from what was captured alone; others have to be there already (an object of
 a class, a function). :func:`uncovered` says which of these were not there when training began, and so will not be when
@@ -284,7 +284,7 @@ class Restore:
             self.locations = locations
 
     def begin(self, value: Any) -> None:
-        """What is inside a value may refer to it: name it before that is restored."""
+        """Register a value before its contents are restored: they may refer to it."""
         if self._numbers[-1] is not None:
             self._seen[self._numbers[-1]] = value
 
@@ -296,7 +296,7 @@ class Restore:
         return is_free
 
     def claims_memory(self, memory: int, there: int) -> bool:
-        """The same for the memory that arrays are parts of."""
+        """Return whether existing memory may become that of captured arrays: not if it has become another already."""
         return self._memory.setdefault(there, memory) == memory
 
     def restore_attributes(self, nodes: dict[str, Any], owner: Any, path: str, optional: bool = False) -> None:

@@ -57,7 +57,7 @@ def nearest_algorithm(policy_class: Any) -> type[OffPolicyAlgorithm] | None:
     return next((algorithm for base, algorithm in known_policies().items() if base in bases), None)
 
 
-# What is made anew when a model is set up or learns; the file's is not looked at
+# What is made again when a model is set up or learns; the file's is not looked at
 _MADE_ANEW = {
     "lr_schedule", "start_time", "ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs",
     "_last_episode_starts", "_last_dones", "tensorboard_log", "device", "env", "eval_env",
@@ -160,7 +160,7 @@ def foreign_names(value: Any, budget: Budget) -> list[str]:
     return code_in(noted, names, {**dict.fromkeys(_HARMLESS, lambda _: True), **TAKEN})
 
 
-# What SB3 and numpy write into fields that are made anew, and into attributes that are not looked at
+# What SB3 and numpy write into fields that are made again, and into attributes that are not looked at
 _HARMLESS = {
     *(Name("collections", kind) for kind in ("deque", "defaultdict", "Counter")),
     *(Name("builtins", kind) for kind in ("set", "frozenset", "complex", "bytearray")),

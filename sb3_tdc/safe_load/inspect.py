@@ -90,7 +90,7 @@ def _describe_model(path: Path, size: int) -> list[str]:
 
 def _list_code(code: dict[str, list[str]]) -> list[str]:
     if not code:
-        return ["Code: none that SB3's own load would import besides what it always does."]
+        return ["Code: none that SB3's own load would import, except for what it always imports."]
     lines = [
         f"  {escaped(name):28} {', '.join(found[:3])}{' …' if len(found) > 3 else ''}" for name, found in code.items()
     ]

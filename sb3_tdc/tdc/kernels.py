@@ -16,10 +16,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from sb3_tdc.tdc.policies import LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
+from sb3_tdc.tdc.policies import LOG_SQRT_2_PI, LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_LOG_SQRT_2_PI = np.float32(0.5 * math.log(2 * math.pi))
+_LOG_SQRT_2_PI = np.float32(LOG_SQRT_2_PI)
 _TANH_EPSILON = np.float32(TANH_EPSILON)
 _LOG_STD_MIN, _LOG_STD_MAX = np.float32(LOG_STD_MIN), np.float32(LOG_STD_MAX)
 

@@ -1,5 +1,6 @@
 """Networks of TDC-λ: SB3's own actors, and quantile critics evaluated all at once."""
 
+import math
 from typing import Any
 
 import torch as th
@@ -104,6 +105,8 @@ class QuantileCritic(ContinuousCritic):
 
 # SB3's limits of log σ, and what its density of the tanh-Gaussian adds to 1 − a²; compiled code has them inside
 LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON = -20.0, 2.0, 1e-6
+# Of the density of a normal distribution
+LOG_SQRT_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 class TanhGaussian(SquashedDiagGaussianDistribution):

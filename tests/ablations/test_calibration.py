@@ -20,11 +20,11 @@ from sb3_tdc.ablations.calibration import (
     MAX_LAM,
     CalibratedTDC,
     Calibration,
-    PendingEpisode,
     calibrate,
     updates_before,
 )
-from sb3_tdc.common.returns import discounted_returns, known_steps
+from sb3_tdc.critics.episodes import Steps
+from sb3_tdc.critics.returns import discounted_returns, known_steps
 from sb3_tdc.resume.run_state import _restart_episodes as restart_episodes
 from tests.helpers.tdc import HEADS, TwoActions, make
 
@@ -114,12 +114,12 @@ def test_it_waits_until_values_can_have_their_size():
 
 
 def test_returns_of_an_episode_by_hand():
-    episode = PendingEpisode()
+    episode = Steps(calibration.EVERY)
     for step in range(25):
         episode.add(np.array([step]), np.array([0.0]), float(step == 24))
     assert [int(o[0]) for o in episode.observations] == [0, 10, 20]
-    assert episode.returns(np.asarray(episode.rewards), 0.5, 0.0).tolist() == [0.5**24, 0.5**14, 0.5**4]
-    assert episode.returns(np.asarray(episode.rewards), 0.5, 6.0).tolist() == [4 * 0.5**24, 4 * 0.5**14, 4 * 0.5**4]
+    assert discounted_returns(episode.rewards, 0.5)[::10].tolist() == [0.5**24, 0.5**14, 0.5**4]
+    assert discounted_returns(episode.rewards, 0.5, 6.0)[::10].tolist() == [4 * 0.5**24, 4 * 0.5**14, 4 * 0.5**4]
 
 
 def test_it_waits_for_steps_and_for_updates():
@@ -163,10 +163,10 @@ def test_an_exact_critic_is_left_alone_though_time_limits_end_the_good_episodes(
     value = 1 / (1 - GAMMA * (1 - HAZARD))
     with_values, known = [], []
     for rewards, terminated in (play(rng) for _ in range(4_000)):
-        episode = PendingEpisode()
+        episode = Steps(calibration.EVERY)
         for reward in rewards:
             episode.add(np.zeros(1), np.zeros(1), reward)
-        with_values.append(episode.returns(rewards, GAMMA, 0.0 if terminated else value))
+        with_values.append(discounted_returns(rewards, GAMMA, 0.0 if terminated else value)[:: episode.every])
         n_known = known_steps(len(rewards), terminated, GAMMA, LIMIT)
         known.append(discounted_returns(rewards, GAMMA)[:n_known])
     assert np.concatenate(with_values).mean() == pytest.approx(value, rel=0.01)

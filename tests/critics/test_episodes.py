@@ -14,10 +14,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import enjoy, train
-from sb3_tdc.common import returns
 from sb3_tdc.common.plots import import_figure
 from sb3_tdc.critics import episodes as explain
-from sb3_tdc.critics import figures
+from sb3_tdc.critics import figures, returns
 from sb3_tdc.runs.callbacks import critic_evaluation
 from sb3_tdc.runs.callbacks.stopping import StopOnSignal
 from sb3_tdc.tdc.quantiles import select_critic
@@ -303,7 +302,7 @@ def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monke
     """What is logged is what one gets by playing the same episodes again."""
     seen = []
     monkeypatch.setattr(critic_evaluation, "summarise", lambda episodes: seen.append(episodes) or {})
-    monkeypatch.setattr(critic_evaluation, "_EVERY", 1)
+    monkeypatch.setattr(critic_evaluation, "EVERY", 1)
     env, eval_env = (VecNormalize(make_env(length=12)) for _ in range(2))
     eval_env.training = eval_env.norm_reward = False
     model = make_model(env, gradient_steps=0)

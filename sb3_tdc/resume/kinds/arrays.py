@@ -103,7 +103,7 @@ def _fits(existing: Any, value: np.ndarray, content: Any) -> bool:
 
 
 def is_native_memory(array: np.ndarray) -> bool:
-    """Return whether the memory may belong to a native object that goes on writing to it, as MuJoCo's does."""
+    """Return whether the memory may belong to a native object that continues writing to it, as MuJoCo's does."""
     return type(_root(array).base).__name__ == "PyCapsule"
 
 

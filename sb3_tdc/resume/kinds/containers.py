@@ -1,4 +1,4 @@
-"""Lists, tuples, dictionaries, sets: made anew, or filled in place where one is there, so that it stays shared."""
+"""Lists, tuples, dictionaries, sets: made again, or filled in place where one is there, so that it stays shared."""
 
 import json
 from collections import Counter, OrderedDict, defaultdict, deque

@@ -275,7 +275,7 @@ def uses_native_package(kind: type) -> str | None:
 
 
 def _is_of_parts(value: Any) -> bool:
-    """Return whether attributes go on without another one: statistics, without the environments below."""
+    """Return whether attributes can continue without another one: statistics, without the environments below."""
     return isinstance(value, (BaseCallback, VecEnvWrapper))
 
 

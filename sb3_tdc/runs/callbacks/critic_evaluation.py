@@ -5,13 +5,11 @@ from typing import Any
 
 from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 
-from sb3_tdc.critics.episodes import Episode, Recording, summarise
+from sb3_tdc.critics.episodes import EVERY, Episode, Recording, summarise
 from sb3_tdc.critics.figures import make_figure, render
 from sb3_tdc.runs.callbacks.stopping import StoppableEvaluation
 from sb3_tdc.tdc import TDC
 
-# Steps of evaluations that the critics are asked about: neighbours tell the same
-_EVERY = 10
 # A figure is drawn while all of this stays below this share of the time since training began
 _SHARE = 0.01
 _SECONDS_OF_FIRST_FIGURE = 2.0
@@ -52,7 +50,7 @@ class CriticEvaluation(StoppableEvaluation):
         """
         i, observations = step["i"], step["observations"]
         if i not in self.recordings:
-            self.recordings[i] = Recording(model, _EVERY, model.get_vec_normalize_env(), self.time_limit)
+            self.recordings[i] = Recording(model, EVERY, model.get_vec_normalize_env(), self.time_limit)
         observation = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
         self.recordings[i].add(observation, step["actions"][i], float(step["reward"]))
         if not step["done"]:

@@ -95,7 +95,8 @@ class Mlp:
             for layer, slope, slope_below in zip(layers[1:], self.slopes[1:], self.slopes, strict=False)
         ]
         self.relu_passes: list[Callable[[], Any]] = [
-            partial(relu_backward, slope, output) for slope, output in zip(self.slopes, outputs, strict=True)
+            partial(passes.threshold_backward, slope, output, 0, grad_input=slope)
+            for slope, output in zip(self.slopes, outputs, strict=True)
         ]
         self.bias_sums: list[Callable[[], Any]] = [
             partial(th.sum, slope, dim=-2, keepdim=True, out=gradient.bias)
@@ -125,14 +126,6 @@ class Mlp:
         self.relu_passes[i]()
         if self.bias_sums:
             self.bias_sums[i]()
-
-
-_threshold_backward = th.ops.aten.threshold_backward.grad_input
-
-
-def relu_backward(slope: th.Tensor, activation: th.Tensor) -> None:
-    """Set the slope to 0 where the activation is."""
-    _threshold_backward(slope, activation, 0, grad_input=slope)
 
 
 class DeterministicHead:

@@ -13,12 +13,11 @@ from typing import Any
 
 import torch as th
 
-from sb3_tdc.tdc.policies import LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
+from sb3_tdc.tdc.policies import LOG_SQRT_2_PI, LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
 from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 
-_LOG_SQRT_2_PI = 0.5 * math.log(2 * math.pi)
-
-_threshold_backward = th.ops.aten.threshold_backward.grad_input
+# Keep a gradient where an activation is above a threshold: with 0, the backward pass of a ReLU
+threshold_backward = th.ops.aten.threshold_backward.grad_input
 _tanh_backward = th.ops.aten.tanh_backward.grad_input
 
 
@@ -111,7 +110,7 @@ def sample_actions(
 
 
 def log_density(sample: th.Tensor, raw_log_std: th.Tensor, noise: th.Tensor, log_prob: th.Tensor) -> None:
-    density = noise.square().mul_(-0.5).sub_(raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)).sub_(_LOG_SQRT_2_PI)
+    density = noise.square().mul_(-0.5).sub_(raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)).sub_(LOG_SQRT_2_PI)
     th.sum(density.sub_((1 - sample.square()).add_(TANH_EPSILON).log_()), dim=1, out=log_prob)
 
 
@@ -136,7 +135,7 @@ def tanh_gaussian_backward(
 def mean_value(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, slope: th.Tensor, values: th.Tensor) -> None:
     mean_weight = weight.mean(dim=1)
     th.addmv(bias.mean().expand(len(hidden)), hidden, mean_weight, out=values)
-    _threshold_backward((mean_weight / -len(hidden)).expand_as(hidden), hidden, 0, grad_input=slope)
+    threshold_backward((mean_weight / -len(hidden)).expand_as(hidden), hidden, 0, grad_input=slope)
 
 
 def gather(

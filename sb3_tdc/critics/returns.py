@@ -10,7 +10,7 @@ TOLERANCE = 0.01
 
 def discounted_returns(rewards: np.ndarray, gamma: float, following: float = 0.0) -> np.ndarray:
     """
-    The discounted sum of the rewards from every step on, G_t = r_t + γ·G_{t+1}.
+    Return the discounted sum of the rewards from every step on, G_t = r_t + γ·G_{t+1}.
 
     :param rewards: (T,)
     :param following: G_T, what comes after the last reward
@@ -26,11 +26,11 @@ def known_steps(
     n_steps: int, terminated: bool, gamma: float, limit: int | None = None, tolerance: float = TOLERANCE
 ) -> int:
     """
-    From how many first steps of an episode the discounted return is known, and would be however it had ended.
+    Return how many initial steps have a known discounted return, however the episode ended.
 
-    :param terminated: whether it ended by itself; after a time limit, rewards would have gone on
-    :param limit: the time limit of the task. So near to it that an episode would have to end by itself for its return
-        to be known, no step counts: of the good episodes none would, and of the bad ones all
+    :param terminated: whether it ended by itself; after a time limit, there would have been more rewards
+    :param limit: the time limit of the task. Steps closer to it than the discount horizon are excluded; otherwise only
+        early failures would count there
     :param tolerance: the largest weight γ^(T−t) of what was not seen
     :return: between 0 and ``n_steps``
     """
