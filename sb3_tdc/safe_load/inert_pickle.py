@@ -45,16 +45,6 @@ class Call:
 
 PERSISTENT = Name("pickle", "persistent_load")
 
-_PUSHED = {
-    "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT", "UNICODE", "BINUNICODE",
-    "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8",
-}  # fmt: skip
-_CONSTANTS: dict[str, Any] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_EMPTY: dict[str, Callable[[], Any]] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
-_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_FROM_MARK: dict[str, Callable[[list[Any]], Any]] = {"TUPLE": tuple, "LIST": list}
-_CALLS = {"REDUCE", "NEWOBJ"}
-_PUT, _GET = {"PUT", "BINPUT", "LONG_BINPUT"}, {"GET", "BINGET", "LONG_BINGET"}
 _SCALARS = (str, bytes, int, float, bool, type(None))
 MAX_KEY = 2**32  # integers below it cannot be chosen so that their hashes collide
 
@@ -70,94 +60,187 @@ def read_pickle(data: bytes | IO[bytes], budget: Budget, noted: list[Name | Call
     :raises UnsafeFileError: if it is damaged, or is more than data, names and calls
     """
     try:
-        return _run(data, budget, [] if noted is None else noted)
+        return _Machine([] if noted is None else noted).run(data, budget)
     except UnsafeFileError:
         raise
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UnsafeFileError("a damaged pickle") from error
 
 
-def _run(data: bytes | IO[bytes], budget: Budget, noted: list[Name | Call]) -> Any:
-    """The pickle machine, in which importing and calling are only noted down."""
-    stack: list[Any] = []
-    marks: list[list[Any]] = []  # the stacks below each MARK
-    memo: dict[int, Any] = {}
+class _Machine:
+    """The pickle machine, in which importing and calling are only noted down. Its operations take their argument."""
 
-    def pop_mark() -> list[Any]:
-        nonlocal stack
-        items, stack = stack, marks.pop()
+    def __init__(self, noted: list[Name | Call]):
+        self.stack: list[Any] = []
+        self.marks: list[list[Any]] = []  # the stacks below each MARK
+        self.memo: dict[int, Any] = {}
+        self.noted = noted
+
+    def run(self, data: bytes | IO[bytes], budget: Budget) -> Any:
+        """Return what the pickle holds."""
+        for opcode, argument, _ in pickletools.genops(data):
+            budget.take_opcode()
+            if opcode.name == "STOP":
+                return self.stack.pop()
+            if opcode.name not in _OPERATIONS:
+                raise UnsafeFileError(f"a pickle with the operation {opcode.name}")
+            _OPERATIONS[opcode.name](self, argument)
+        raise UnsafeFileError("a truncated pickle")
+
+    # ---------------------------------------------------------------- values
+
+    def push(self, value: Any) -> None:
+        if isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
+            raise UnsafeFileError(f"an integer of {value.bit_length():,} bits")
+        self.stack.append(value)
+
+    def pop(self, _: None) -> None:
+        self.stack.pop()
+
+    def ignore(self, _: Any) -> None:
+        pass
+
+    # ---------------------------------------------------------------- the memo
+
+    def memoize(self, _: None) -> None:
+        self.memo[len(self.memo)] = self.stack[-1]
+
+    def put(self, index: int) -> None:
+        self.memo[index] = self.stack[-1]
+
+    def get(self, index: int) -> None:
+        self.stack.append(self.memo[index])
+
+    # ---------------------------------------------------------------- collections
+
+    def mark(self, _: None) -> None:
+        self.marks.append(self.stack)
+        self.stack = []
+
+    def _pop_mark(self) -> list[Any]:
+        items, self.stack = self.stack, self.marks.pop()
         return items
 
-    def push_noted(part: Name | Call) -> None:
-        noted.append(part)
-        stack.append(part)
+    def make_tuple(self, _: None) -> None:
+        items = self._pop_mark()
+        self.stack.append(tuple(items))
 
-    argument: Any
-    for opcode, argument, _ in pickletools.genops(data):
-        name = opcode.name
-        budget.take_opcode()
-        if name in _PUSHED:
-            if isinstance(argument, int) and argument.bit_length() > MAX_INTEGER_BITS:
-                raise UnsafeFileError(f"an integer of {argument.bit_length():,} bits")
-            stack.append(argument)
-        elif name == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif name in _PUT:
-            memo[argument] = stack[-1]
-        elif name in _GET:
-            stack.append(memo[argument])
-        elif name in _CONSTANTS:
-            stack.append(_CONSTANTS[name])
-        elif name in _EMPTY:
-            stack.append(_EMPTY[name]())
-        elif name == "POP":
-            stack.pop()
-        elif name == "MARK":
-            marks.append(stack)
-            stack = []
-        elif name in _FROM_MARK:
-            items = pop_mark()
-            stack.append(_FROM_MARK[name](items))
-        elif name in _TUPLES:
-            stack[-_TUPLES[name] :] = [tuple(_last(stack, _TUPLES[name]))]
-        elif name == "DICT":
-            items = pop_mark()
-            stack.append({})
-            _set_items(stack[-1], items)
-        elif name in ("APPEND", "APPENDS"):
-            items = pop_mark() if name == "APPENDS" else [stack.pop()]
-            target = stack[-1]
-            (target.items if isinstance(target, Call) else target).extend(items)
-        elif name in ("SETITEM", "SETITEMS"):
-            items = pop_mark() if name == "SETITEMS" else [stack.pop(-2), stack.pop()]
-            _set_items(stack[-1], items)
-        elif name in ("ADDITEMS", "FROZENSET"):
-            items = pop_mark()
-            if not all(map(_is_key, items)):
-                raise UnsafeFileError("a set of more than small integers and texts")
-            stack[-1].update(items) if name == "ADDITEMS" else stack.append(set(items))
-        elif name == "GLOBAL":
-            push_noted(Name(*argument.split(" ", 1)))
-        elif name == "STACK_GLOBAL":
-            attribute, module = stack.pop(), stack.pop()
-            if not (isinstance(module, str) and isinstance(attribute, str)):
-                raise UnsafeFileError("an import of something that is not a name")
-            push_noted(Name(module, attribute))
-        elif name in _CALLS:
-            args, function = stack.pop(), stack.pop()
-            push_noted(Call(function, args))
-        elif name == "BINPERSID":
-            push_noted(Call(PERSISTENT, stack.pop()))
-        elif name == "BUILD":
-            state = stack.pop()
-            if stack[-1].state is not None:  # of a Call; anything else has no such attribute
-                raise UnsafeFileError("an object that is changed twice")
-            stack[-1].state = state
-        elif name == "STOP":
-            return stack.pop()
-        elif name not in ("PROTO", "FRAME"):
-            raise UnsafeFileError(f"a pickle with the operation {name}")
-    raise UnsafeFileError("a truncated pickle")
+    def make_list(self, _: None) -> None:
+        items = self._pop_mark()
+        self.stack.append(items)
+
+    def make_dict(self, _: None) -> None:
+        items = self._pop_mark()
+        self.stack.append({})
+        _set_items(self.stack[-1], items)
+
+    def make_set(self, _: None) -> None:
+        items = _checked_elements(self._pop_mark())
+        self.stack.append(set(items))
+
+    def append(self, _: None) -> None:
+        item = self.stack.pop()
+        self._extend([item])
+
+    def append_marked(self, _: None) -> None:
+        self._extend(self._pop_mark())
+
+    def _extend(self, items: list[Any]) -> None:
+        target = self.stack[-1]
+        (target.items if isinstance(target, Call) else target).extend(items)
+
+    def set_item(self, _: None) -> None:
+        items = [self.stack.pop(-2), self.stack.pop()]
+        _set_items(self.stack[-1], items)
+
+    def set_marked_items(self, _: None) -> None:
+        items = self._pop_mark()
+        _set_items(self.stack[-1], items)
+
+    def add_marked(self, _: None) -> None:
+        items = _checked_elements(self._pop_mark())
+        self.stack[-1].update(items)
+
+    # ---------------------------------------------------------------- imports and calls, noted down
+
+    def _note(self, part: Name | Call) -> None:
+        self.noted.append(part)
+        self.stack.append(part)
+
+    def import_name(self, argument: str) -> None:
+        self._note(Name(*argument.split(" ", 1)))
+
+    def import_from_stack(self, _: None) -> None:
+        attribute, module = self.stack.pop(), self.stack.pop()
+        if not (isinstance(module, str) and isinstance(attribute, str)):
+            raise UnsafeFileError("an import of something that is not a name")
+        self._note(Name(module, attribute))
+
+    def call(self, _: None) -> None:
+        args, function = self.stack.pop(), self.stack.pop()
+        self._note(Call(function, args))
+
+    def call_persistent_load(self, _: None) -> None:
+        self._note(Call(PERSISTENT, self.stack.pop()))
+
+    def build(self, _: None) -> None:
+        state = self.stack.pop()
+        if self.stack[-1].state is not None:  # of a Call; anything else has no such attribute
+            raise UnsafeFileError("an object that is changed twice")
+        self.stack[-1].state = state
+
+
+def _pushing(make: Callable[[], Any]) -> Callable[[_Machine, None], None]:
+    """Return the operation that pushes a new value."""
+    return lambda machine, _: machine.stack.append(make())
+
+
+def _making_tuple(n: int) -> Callable[[_Machine, None], None]:
+    """Return the operation that makes a tuple of the last n values."""
+
+    def operation(machine: _Machine, _: None) -> None:
+        machine.stack[-n:] = [tuple(_last(machine.stack, n))]
+
+    return operation
+
+
+# All that a pickle may do, except STOP
+_OPERATIONS: dict[str, Callable[[_Machine, Any], None]] = {
+    **dict.fromkeys(("PROTO", "FRAME"), _Machine.ignore),
+    **dict.fromkeys(("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4"), _Machine.push),
+    **dict.fromkeys(("FLOAT", "BINFLOAT"), _Machine.push),
+    **dict.fromkeys(("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"), _Machine.push),
+    **dict.fromkeys(("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"), _Machine.push),
+    "NONE": _pushing(lambda: None),
+    "NEWTRUE": _pushing(lambda: True),
+    "NEWFALSE": _pushing(lambda: False),
+    "EMPTY_TUPLE": _pushing(tuple),
+    "EMPTY_LIST": _pushing(list),
+    "EMPTY_DICT": _pushing(dict),
+    "EMPTY_SET": _pushing(set),
+    "POP": _Machine.pop,
+    "MEMOIZE": _Machine.memoize,
+    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _Machine.put),
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _Machine.get),
+    "MARK": _Machine.mark,
+    "TUPLE": _Machine.make_tuple,
+    "TUPLE1": _making_tuple(1),
+    "TUPLE2": _making_tuple(2),
+    "TUPLE3": _making_tuple(3),
+    "LIST": _Machine.make_list,
+    "DICT": _Machine.make_dict,
+    "FROZENSET": _Machine.make_set,
+    "APPEND": _Machine.append,
+    "APPENDS": _Machine.append_marked,
+    "SETITEM": _Machine.set_item,
+    "SETITEMS": _Machine.set_marked_items,
+    "ADDITEMS": _Machine.add_marked,
+    "GLOBAL": _Machine.import_name,
+    "STACK_GLOBAL": _Machine.import_from_stack,
+    **dict.fromkeys(("REDUCE", "NEWOBJ"), _Machine.call),
+    "BINPERSID": _Machine.call_persistent_load,
+    "BUILD": _Machine.build,
+}
 
 
 def _last(stack: list[Any], n: int) -> list[Any]:
@@ -168,6 +251,12 @@ def _last(stack: list[Any], n: int) -> list[Any]:
 
 def _is_key(value: Any) -> bool:
     return isinstance(value, str | bool | None) or (isinstance(value, int) and abs(value) < MAX_KEY)
+
+
+def _checked_elements(items: list[Any]) -> list[Any]:
+    if not all(map(_is_key, items)):
+        raise UnsafeFileError("a set of more than small integers and texts")
+    return items
 
 
 def _set_items(target: Any, items: list[Any]) -> None:
