@@ -104,7 +104,7 @@ def hyperparams_file(algo: str) -> Path:
 
 def read_entry(path: Path, env_id: str, preset: str | None = None) -> tuple[dict[str, Any], str]:
     """
-    The entry of an environment, or else of its nearest version, with the file's ``default`` merged under it.
+    Return the entry of an environment, or else of its nearest version, with the file's ``default`` merged under it.
 
     :param preset: the name of an entry to take instead
     :return: the entry and its name in the file: ``default`` if there is none of any version
@@ -137,7 +137,7 @@ def _nearest_version(env_id: str, names: Iterable[Any]) -> str:
 
 
 def _split_version(env_id: str) -> tuple[str, int]:
-    """``Walker2d-v4`` → ``("Walker2d", 4)``; without a version, −1."""
+    """Return ``("Walker2d", 4)`` for ``Walker2d-v4``; without a version, −1."""
     base, _, version = env_id.rpartition("-v")
     return (base, int(version)) if base and version.isdecimal() else (env_id, -1)
 
@@ -346,7 +346,7 @@ def _convert_union(value: Any, members: tuple[Any, ...]) -> Any:
 
 
 def _number(value: Any) -> float:
-    """Numbers, and the texts that YAML makes of 3e-4 and 1e6."""
+    """Return a number: it may be given as one of the texts that YAML makes of 3e-4 and 1e6."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise TypeError
     try:
@@ -377,7 +377,7 @@ def _import_class(name: Any, base: Any = object) -> type:
 
 
 def _factories(entries: Any, where: str) -> list[Callable]:
-    """``module.Class``, ``{module.Class: {keyword: value}}``, or a list of these."""
+    """Convert ``module.Class``, ``{module.Class: {keyword: value}}``, or a list of these."""
     factories = []
     for entry in [] if entries is None else entries if isinstance(entries, list) else [entries]:
         name, kwargs = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else (entry, {})

@@ -33,7 +33,7 @@ def register() -> None:
 
 def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
-    Optuna's search space: RL Zoo's for TD3, λ among the paper's candidates (and 0), and the quantiles.
+    Sample Optuna's search space: RL Zoo's for TD3, λ among the paper's candidates (and 0), and the quantiles.
 
     :param trial: an ``optuna.Trial``
     :return: keyword arguments of TDC
@@ -48,7 +48,7 @@ def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: 
 
 def sample_meow_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
-    Optuna's search space: RL Zoo's for TD3 without its noise, the temperature, and the upper limit of log σ.
+    Sample Optuna's search space: RL Zoo's for TD3 without its noise, α, and the upper limit of log σ.
 
     :param trial: an ``optuna.Trial``
     :return: keyword arguments of MEOW
@@ -94,8 +94,9 @@ def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    RL Zoo's ``train`` or ``enjoy`` with TDC and MEOW in it; ``train --algo tdc`` without ``-conf`` takes this package's
-    hyperparameters, and so does ``--algo meow``.
+    Run RL Zoo's ``train`` or ``enjoy`` with TDC and MEOW in it.
+
+    ``train`` with ``--algo tdc`` or ``meow``, and without ``-conf``, takes this package's hyperparameters.
 
     :param argv: arguments, those of the process by default
     """

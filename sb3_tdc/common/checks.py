@@ -34,7 +34,7 @@ def _allowed(kind: str, minimum: float, maximum: float) -> str:
 
 
 def _as_number(value: Any) -> float:
-    """Whatever ``float()`` takes, for instance an array of one number, but no text and no truth value; else NaN."""
+    """Return what ``float()`` makes of a value that is neither a text nor a truth value; NaN if there is no number."""
     if isinstance(value, (str, bytes, bool, np.bool_)):
         return math.nan
     try:

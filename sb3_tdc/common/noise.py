@@ -56,7 +56,7 @@ class VectorizedNormalNoise(VectorizedActionNoise):
 
     @property  # type: ignore[override]
     def noises(self) -> "tuple[_NoiseOfOne, ...]":
-        """The noise of every environment: what is changed of it changes ``mean`` and ``sigma``."""
+        """Return the noise of every environment: what is changed of it changes ``mean`` and ``sigma``."""
         return tuple(_NoiseOfOne(self, i) for i in range(self.n_envs))
 
     @noises.setter  # type: ignore[override]
@@ -116,7 +116,11 @@ class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     @property
     def action_noise(self) -> ActionNoise | None:
-        """Exploration noise. A number put here becomes Gaussian noise, and noise of one environment that of all."""
+        """
+        Return the exploration noise.
+
+        A number put here becomes Gaussian noise, and noise of one environment that of all.
+        """
         try:
             return vars(self)["action_noise"]
         except KeyError:

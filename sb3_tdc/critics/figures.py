@@ -21,7 +21,7 @@ _STYLES = ("-", "--")  # so that critics that agree are both seen
 
 
 def draw_fan(axes: Any, episode: Episode, critic: int) -> None:
-    """Predicted quantiles of one critic along an episode (bands of 50 % and 90 %) and the realised return."""
+    """Draw the predicted quantiles of one critic along an episode (bands of 50 % and 90 %) and the realised return."""
     quantiles, color = episode.quantiles[:, critic], _COLORS[critic % len(_COLORS)]
     for share, alpha in ((0.9, 0.2), (0.5, 0.35)):
         low, high = np.quantile(quantiles, [0.5 - share / 2, 0.5 + share / 2], axis=1)
@@ -33,7 +33,7 @@ def draw_fan(axes: Any, episode: Episode, critic: int) -> None:
 
 
 def draw_selection(axes: Any, episode: Episode) -> None:
-    """σ of every critic along an episode; dots mark the critic that is selected."""
+    """Draw σ of every critic along an episode; dots mark the critic that is selected."""
     for critic, std in enumerate(episode.stds.T):
         color = _COLORS[critic % len(_COLORS)]
         chosen = episode.selected == critic
@@ -45,7 +45,7 @@ def draw_selection(axes: Any, episode: Episode) -> None:
 
 
 def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
-    """Observed frequency against nominal level, a thin line for each episode and a thick one for all their steps."""
+    """Draw observed frequency against nominal level: a thin line for each episode, a thick one for all their steps."""
     known = [episode for episode in episodes if np.isfinite(episode.returns).any()]
     axes.plot([0, 1], [0, 1], ":", color="grey", lw=1)
     for critic in range(episodes[0].quantiles.shape[1]):
@@ -72,7 +72,7 @@ def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
 
 
 def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
-    """Predicted mean − realised return along the episodes, one thin line for each and critic."""
+    """Draw predicted mean − realised return along the episodes, one thin line for each and critic."""
     axes.axhline(0, color="grey", ls=":", lw=1)
     for critic in range(episodes[0].quantiles.shape[1]):
         color = _COLORS[critic % len(_COLORS)]
@@ -90,7 +90,7 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
 
 
 def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
-    """|G − μ| against σ at every step, and the mean of tenths of the steps: does σ mean uncertainty?"""
+    """Draw |G − μ| against σ at every step, and the mean of tenths of the steps: does σ mean uncertainty?"""
     pooled = pool(episodes)
     known = len(pooled.returns) > 0
     of_critics = [array.T for array in spread_and_errors(pooled)] if known else [np.empty((0, 0))] * 3
@@ -109,7 +109,7 @@ def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
 
 
 def draw_lam(axes: Any, episodes: Sequence[Episode], lam: float) -> None:
-    """The share of steps at which a λ selects another critic than λ = 0 does, against that λ."""
+    """Draw the share of steps at which a λ selects another critic than λ = 0 does, against that λ."""
     pairs = [th.as_tensor(np.concatenate([getattr(e, name) for e in episodes])) for name in ("means", "stds")]
     thresholds = critical_lam(*pairs).numpy()
     grid = np.linspace(0, max(2.0, 1.5 * lam), 200)
@@ -125,7 +125,7 @@ def draw_lam(axes: Any, episodes: Sequence[Episode], lam: float) -> None:
 
 def make_figure(episodes: Sequence[Episode], title: str, lam: float, note: str = "") -> Any:
     """
-    All of the above on one page.
+    Draw all of the above on one page.
 
     :param lam: the model's λ now
     :return: a figure of matplotlib
@@ -160,7 +160,7 @@ def render(figure: Any) -> np.ndarray:
 
 
 def describe_play(model: TDC) -> str:
-    """What one must know to read the figures."""
+    """Return what one must know to read the figures."""
     target = "samples of the tanh-Gaussian" if model.stochastic_actor else "the mean action with smoothing noise"
     paragraphs = (
         f"Played: the mean action, without noise. The critics are trained for another policy, {target}, without "

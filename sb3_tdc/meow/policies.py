@@ -110,7 +110,7 @@ class EnergyFlow(BaseModel):
 
 
 def _log_normalizer(log_std: th.Tensor) -> th.Tensor:
-    """(B, A) → (B, 1)."""
+    """Return (B, 1), the logs of the normalising constants of N(0, σ²), from (B, A), log σ."""
     return (log_std + 0.5 * math.log(2 * math.pi)).sum(dim=1, keepdim=True)
 
 

@@ -198,7 +198,7 @@ class ResumeStates(BaseCallback):
         return run_state.verify(model, self.root)[0]
 
     def _verify(self) -> None:
-        """At the start, and again in every process that resumes."""
+        """Tell what a resumed run would not have: at the start, and again in every process that resumes."""
         names, self._initial = run_state.verify(self.model, self.root)  # type: ignore[arg-type]
         self._tell(names)
 
@@ -294,7 +294,7 @@ class ResumeStates(BaseCallback):
         return segments, {segment.name: digests[segment.name] for segment in segments}
 
     def _copier(self, file: Path) -> Callable[[Path], None]:
-        """A link to the last state's copy if the file has not changed since."""
+        """Return what copies a file: as a link to the last state's copy, if it has not changed since."""
 
         def copy(path: Path) -> None:
             now = file.stat()

@@ -23,7 +23,7 @@ def differences(before: Capture, after: Capture) -> list[str]:
 
 
 def _canonical(capture: Capture, path: str) -> Any:
-    """With arrays in the place of their numbers, and objects numbered in the order in which they come."""
+    """Return an attribute with arrays in the place of their numbers, and objects numbered in the order they come in."""
     numbers: dict[Any, int] = {}
     first = capture.first_arrays.get(path, 0)
 

@@ -185,7 +185,7 @@ def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) ->
 
 
 def _own_attributes(env: VecEnv) -> dict[str, Any]:
-    """What else there is is overwritten by every step."""
+    """Return the attributes that are captured: every step overwrites the others."""
     names = ("observation_space", "action_space", "_seeds", "_options")
     return {name: vars(env)[name] for name in names}
 

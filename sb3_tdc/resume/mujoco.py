@@ -16,7 +16,7 @@ def _model_bytes(model: Any) -> bytes:
 
 
 def capture_mj_data(data: Any) -> dict[str, Any]:
-    """MuJoCo's own bytes of the whole ``MjData``, without the model that it puts among them."""
+    """Capture MuJoCo's own bytes of the whole ``MjData``, without the model that it puts among them."""
     whole, model = data.__getstate__(), _model_bytes(data.model)
     before, found, after = whole.partition(model)
     if not found:

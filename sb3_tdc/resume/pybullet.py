@@ -14,7 +14,7 @@ def is_client(value: Any) -> bool:
 
 def capture_world(client: Any) -> dict[str, Any]:
     """
-    Positions, velocities, contacts with the impulses from which the solver starts; and what bodies there are.
+    Capture positions, velocities, contacts with the impulses that the solver starts from; and what bodies there are.
 
     :raises NotCapturedError: if several bodies move: from PyBullet's file, contacts between them continue differently
     """

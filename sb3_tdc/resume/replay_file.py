@@ -123,7 +123,7 @@ def _what_comes_back(info: dict[Any, Any], left_out: list[str]) -> dict[Any, Any
 
 
 def _capture() -> Capture:
-    """When a run is resumed, the ring is empty: there are no objects that could get back what they held."""
+    """Return a capture without initial objects: when a run is resumed, the ring is empty."""
     return Capture(KINDS, initial=Initial({}, {}, {}))
 
 
@@ -171,7 +171,7 @@ def _slots(buffer: ReplayBuffer, segment: Segment) -> np.ndarray:
 
 
 def _take(ring: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """A view where the slots do not go around the end of the ring."""
+    """Return slots of a ring: a view where they do not wrap around its end."""
     return ring[slots[0] : slots[-1] + 1] if slots[0] <= slots[-1] else ring[slots]
 
 
@@ -195,7 +195,7 @@ def _restore_infos(buffer: ReplayBuffer, slots: np.ndarray, stored: np.ndarray) 
 
 
 def _text_of(dtype: np.dtype) -> str:
-    """As numpy's files have it: ``dtype.str`` of a type with fields does not name them."""
+    """Return a type as numpy's files have it: ``dtype.str`` of a type with fields does not name them."""
     return dtype.str if dtype.names is None else repr(np.lib.format.dtype_to_descr(dtype))
 
 

@@ -16,7 +16,7 @@ class Restorable(gym.Wrapper):
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # a property in Wrapper, too
-        """The environment's spec, in short where it cannot be sent to another process: it may hold functions."""
+        """Return the environment's spec, in short where it cannot be sent to another process: it may hold functions."""
         spec = self.env.spec
         try:
             pickle.dumps(spec)

@@ -37,7 +37,7 @@ def capture_state(
     model: OffPolicyAlgorithm, callback: BaseCallback, initial: Initial | None = None
 ) -> tuple[dict[str, Any], Capture]:
     """
-    What cannot be captured, or would not be restored, is left out and noted.
+    Capture all but the weights and the transitions; what cannot be captured or restored is left out and noted.
 
     :param callback: the root of all callbacks
     :param initial: of the capture of all this as it was built; None for that capture itself
@@ -71,7 +71,7 @@ def restore_state(
     changed: Sequence[str] = (),
 ) -> None:
     """
-    Everything but the weights and the rings of the replay buffer, which are there already.
+    Restore everything but the weights and the rings of the replay buffer, which are there already.
 
     :param context: with the arrays; it notes what could not be restored, and why episodes have to be started again
     :param changed: hyperparameters that stay as they are, out of those of :func:`changeable`
@@ -143,7 +143,7 @@ def verify(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[list[str]
 
 
 def _known(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """What is captured on its own, and may be referred to from anywhere."""
+    """Return what is captured on its own, and may be referred to from anywhere."""
     known: dict[str, Any] = {"model": model, "replay_buffer": model.replay_buffer}
     known |= {f"policy.{name}": module for name, module in model.policy.named_modules()}
     known |= {f"policy.{name}": parameter for name, parameter in model.policy.named_parameters()}
@@ -201,7 +201,7 @@ def capture_weights(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def restore_weights(model: OffPolicyAlgorithm, weights: dict[str, Any]) -> None:
-    """In place, so that optimizers and targets stay those of the parameters."""
+    """Restore weights in place, so that optimizers and targets stay those of the parameters."""
     for name, state in weights["state_dicts"].items():
         recursive_getattr(model, name).load_state_dict(state)
     with th.no_grad():
@@ -264,7 +264,7 @@ def _set_random_state(state: dict[str, Any]) -> None:
 
 
 def _restart_episodes(model: OffPolicyAlgorithm) -> None:
-    """What the replay buffer holds of the episodes under way ends there, as if a time limit had been reached."""
+    """End the episodes under way in the replay buffer, as if a time limit had been reached, and begin new ones."""
     assert model.env is not None
     buffer = _buffer(model)
     if buffer.size() > 0:

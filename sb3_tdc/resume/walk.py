@@ -363,7 +363,7 @@ def plain(
     owner: Callable[[Any], Any] | None = None,
 ) -> Kind:
     """
-    A kind whose state is a dict of plain values.
+    Return a kind whose state is a dict of plain values.
 
     :param restore: takes the existing value (MISSING if it has become another one) and this dict, returns the value
     :param owner: takes the value, returns what arrays have as their base that are views of its memory
@@ -383,7 +383,7 @@ def plain(
 
 def uncovered(kinds: "Kinds", node: Any, initial: Any, path: str) -> Iterator[str]:
     """
-    What of a captured value cannot be restored into the objects that were there when training began.
+    Yield what of a captured value cannot be restored into the objects that were there when training began.
 
     :param node: the value
     :param initial: what was captured at that time in its place

@@ -55,7 +55,7 @@ def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: Budget
 
 
 def _directory_size(file: IO[bytes]) -> int:
-    """The size of a zip's list of entries, which ``ZipFile`` would read whole; from the records at its end alone."""
+    """Return the size of a zip's list of entries, which ``ZipFile`` would read whole, from the records at its end."""
     size = file.seek(0, io.SEEK_END)
     if size > MAX_BYTES:
         raise UnsafeFileError(f"it has {size:,} bytes, more than {MAX_BYTES:,}")

@@ -52,7 +52,7 @@ def saved_fields(algorithm: type[OffPolicyAlgorithm]) -> dict[str, SavedField]:
 
 
 def nearest_algorithm(policy_class: Any) -> type[OffPolicyAlgorithm] | None:
-    """The algorithm of a policy of the caller's own, which custom_objects gave."""
+    """Return the algorithm of a custom policy, which custom_objects gave."""
     bases = policy_class.__mro__ if isinstance(policy_class, type) else ()
     return next((algorithm for base, algorithm in known_policies().items() if base in bases), None)
 

@@ -55,7 +55,7 @@ def _state(call: Call) -> dict[str, Any]:
 
 
 def _attributes(call: Call, make: Rebuild, *names: str) -> list[Any]:
-    """Some attributes of an object, in order; the others are never looked at."""
+    """Return some attributes of an object, in order; the others are never looked at."""
     state = _state(call)
     missing = [name for name in names if name not in state]
     if missing:
@@ -253,7 +253,7 @@ def _enum_of_value(call: Call, make: Rebuild) -> Enum:
 
 
 def _enum_of_name(call: Call, make: Rebuild) -> Enum:
-    """``getattr(SomeEnum, "MEMBER")``, as the first versions of Python 3.11 pickle a member; of nothing but an enum."""
+    """Return the member of ``getattr(SomeEnum, "MEMBER")``, as the first versions of Python 3.11 pickle it."""
     cls, member = call.args
     return _ENUMS[cls][member]
 

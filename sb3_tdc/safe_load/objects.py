@@ -25,7 +25,7 @@ from sb3_tdc.safe_load.sb3_fields import MAX_ENVS
 
 def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
     """
-    What ``VecNormalize.load`` does, without running anything that is in the file.
+    Do what ``VecNormalize.load`` does, without running anything that is in the file.
 
     :param path: statistics as SB3 and RL Zoo save them (``vecnormalize.pkl``)
     :param env: the environment to normalise
@@ -45,7 +45,7 @@ def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
 
 def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
     """
-    What ``model.load_replay_buffer`` does, without running anything that is in the file.
+    Do what ``model.load_replay_buffer`` does, without running anything that is in the file.
 
     :param path: a replay buffer as SB3 saves it, of the same class, size and number of environments as the model's
     :raises UnsafeFileError: if the file is refused or damaged, or is not such a replay buffer
@@ -89,7 +89,7 @@ def _read_object(path: str | Path, cls: type, read_state: Callable[[Call, Rebuil
 
 
 def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
-    """The keyword arguments of ``VecNormalize``, and its statistics; nothing else of the pickle is looked at."""
+    """Return the keyword arguments of ``VecNormalize``, and its statistics; nothing else of the pickle is looked at."""
     state = call.state
     if not isinstance(state, dict):
         raise UnsafeFileError("VecNormalize without its attributes")
@@ -106,8 +106,9 @@ def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
 
 def _arrays_like(buffer: ReplayBuffer) -> Callable[[Call, Rebuild], dict[str, Any]]:
     """
-    Of a replay buffer only its arrays of numbers, its position and its number of environments are looked at, and the
-    infos of its transitions if hindsight computes rewards with them.
+    Return what reads a replay buffer: its arrays of numbers, its position and its number of environments alone.
+
+    If hindsight computes rewards with the infos of transitions, it reads them, too.
     """
     names = [name for name, value in vars(buffer).items() if isinstance(value, dict) or _is_numeric(value)]
 

@@ -14,7 +14,7 @@ MAX_ITEMS = 64  # of a list or mapping in the arguments of a network or an optim
 
 @contextmanager
 def reading(what: str) -> Iterator[None]:
-    """Whatever a damaged file makes a library raise becomes one error of one sentence, with its place before it."""
+    """Make whatever a damaged file makes a library raise one error of one sentence, with its place before it."""
     try:
         yield
     except Exception as error:

@@ -73,7 +73,7 @@ class QuantileCritic(ContinuousCritic):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:  # type: ignore[override]
         """
-        Quantiles of every critic (Eq. 3).
+        Return the quantiles of every critic (Eq. 3).
 
         :param obs: (B, ...) observations
         :param actions: (B, A) actions in [-1, 1]
@@ -89,7 +89,7 @@ class QuantileCritic(ContinuousCritic):
 
     def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        Value for the actor: the mean of the first critic's quantiles (Eq. 11).
+        Return the value for the actor: the mean of the first critic's quantiles (Eq. 11).
 
         :param obs: (B, ...) observations
         :param actions: (B, A) actions in [-1, 1]

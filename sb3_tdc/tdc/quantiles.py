@@ -20,7 +20,7 @@ _CHUNK_ELEMENTS = 2**18
 
 def quantile_midpoints(n_quantiles: int, device: th.device | str = "cpu") -> th.Tensor:
     """
-    The fixed quantile levels (2k − 1) / 2N of a critic's outputs.
+    Return the fixed quantile levels (2k − 1) / 2N of a critic's outputs.
 
     :param n_quantiles: N, at least 1
     :return: (N,)
@@ -30,7 +30,7 @@ def quantile_midpoints(n_quantiles: int, device: th.device | str = "cpu") -> th.
 
 def mean_and_std(quantiles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
-    Mean and *population* standard deviation over the quantiles (Eq. 4).
+    Return the mean and the *population* standard deviation over the quantiles (Eq. 4).
 
     :param quantiles: (..., N)
     :return: two tensors (...,)
@@ -43,7 +43,7 @@ def mean_and_std(quantiles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
 def select_critic(mean: th.Tensor, std: th.Tensor, lam: th.Tensor | float) -> th.Tensor:
     """
-    The critic with the smallest mean − λ·std, per transition (Eq. 5). Of equal critics, the first.
+    Return the critic with the smallest mean − λ·std, per transition (Eq. 5). Of equal critics, the first.
 
     :param mean: (B, C)
     :param std: (B, C)
@@ -54,7 +54,7 @@ def select_critic(mean: th.Tensor, std: th.Tensor, lam: th.Tensor | float) -> th
 
 def take_critic(quantiles: th.Tensor, index: th.Tensor) -> th.Tensor:
     """
-    The quantiles of one critic per transition (Eq. 6).
+    Return the quantiles of one critic per transition (Eq. 6).
 
     :param quantiles: (B, C, N)
     :param index: (B,) indices of critics
@@ -67,7 +67,7 @@ def td_target(
     rewards: th.Tensor, dones: th.Tensor, discounts: th.Tensor | float, next_quantiles: th.Tensor
 ) -> th.Tensor:
     """
-    y_j = r + γ(1 − d)·z_j (Eq. 7).
+    Return y_j = r + γ(1 − d)·z_j (Eq. 7).
 
     :param rewards: (B, 1)
     :param dones: (B, 1), 1 where the episode terminated (not where it was truncated)
@@ -107,7 +107,7 @@ def lcb_target(
     lam: th.Tensor | float,
 ) -> Target:
     """
-    The λ-LCB target: of the critic with the smallest mean − λ·std, per transition (Eq. 4–7).
+    Return the λ-LCB target: that of the critic with the smallest mean − λ·std, per transition (Eq. 4–7).
 
     :param next_quantiles: (B, C, N), of the target critics at (s', ã)
     :param rewards: (B, 1)
@@ -130,7 +130,7 @@ def _check_shapes(current: th.Tensor, target: th.Tensor) -> None:
 
 
 def _row_chunks(n_rows: int, pairs: int) -> list[slice]:
-    """Slices of rows whose all-pairs differences fit the cache together."""
+    """Return slices of rows whose all-pairs differences fit the cache together."""
     size = max(1, _CHUNK_ELEMENTS // pairs)
     return [slice(i, min(i + size, n_rows)) for i in range(0, n_rows, size)]
 
@@ -181,7 +181,7 @@ def _find_kernels(*tensors: th.Tensor) -> ModuleType | None:
 
 def quantile_huber_gradient(current: th.Tensor, target: th.Tensor, kappa: float = 1.0) -> th.Tensor:
     """
-    Gradient of :func:`quantile_huber_loss` with respect to ``current`` (see :class:`QuantileHuberGradient`).
+    Return the gradient of :func:`quantile_huber_loss` with respect to ``current`` (see :class:`QuantileHuberGradient`).
 
     :param current: (B, C, N)
     :param target: (B, M)
@@ -236,7 +236,7 @@ class _QuantileHuberLoss(th.autograd.Function):
 
 def quantile_huber_loss(current: th.Tensor, target: th.Tensor, kappa: float = 1.0) -> th.Tensor:
     """
-    Quantile-Huber loss over all pairs of current and target quantiles (Eq. 8–10).
+    Return the quantile-Huber loss over all pairs of current and target quantiles (Eq. 8–10).
 
     δ_kj = y_j − z_k, ρ = |τ_k − 1{δ<0}|·L_κ(δ), L_κ(δ) = δ²/2 for |δ| ≤ κ, else κ(|δ| − κ/2); for κ = 0, |δ|.
     Mean over pairs and transitions, summed over critics, not divided by κ. Differentiable in ``current``, once;

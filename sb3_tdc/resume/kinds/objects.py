@@ -172,7 +172,7 @@ def _is_full(cell: Any) -> bool:
 
 
 def _digest(code: types.CodeType) -> str:
-    """Of what a function does; not of where it is written, which any change of its file moves."""
+    """Return a digest of what a function does, not of where it is written, which any change of its file moves."""
     parts = [code.co_code.hex(), *map(repr, (code.co_names, code.co_varnames, code.co_freevars, code.co_argcount))]
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):

@@ -51,10 +51,10 @@ _GLOBAL_HOOKS: list[dict[int, Any]] = [
 
 def obstacles(model: Any) -> list[str]:
     """
-    Examine a model.
+    Return what stands in the way of the fused update.
 
     :param model: a :class:`~sb3_tdc.tdc.tdc.TDC`
-    :return: what stands in the way of the fused update, in words; nothing where it applies
+    :return: sentences; none where it applies
     """
     policy, space = model.policy, model.observation_space
     found = [f"{name} is overridden" for name in model.overridden_methods()]
@@ -90,7 +90,7 @@ def obstacles(model: Any) -> list[str]:
 
 
 def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
-    """What is not a ReLU network of the known kind."""
+    """Yield what is not a ReLU network of the known kind."""
     if type(network) not in (DeterministicActor, TanhGaussianActor, QuantileCritic):
         yield f"the {name} is a custom class, {type(network).__qualname__}"
         return
@@ -114,12 +114,12 @@ def constants_of(distribution: Any) -> tuple[float, ...]:
 
 
 def _replaced_methods(module: nn.Module) -> list[str]:
-    """The methods of a class that are others on this instance."""
+    """Return the methods of a class that are others on this instance."""
     return [name for name in vars(module) if callable(getattr(type(module), name, None))]
 
 
 def _stacks(network: Any) -> list[Any] | None:
-    """The linear layers of a network in the order of its forward pass, or None if there is anything else."""
+    """Return the linear layers of a network in the order of its forward pass, or None if there is anything else."""
     if type(network) is QuantileCritic:
         return _linear_layers(list(network.layers), StackedLinear, [])
     if type(network) is DeterministicActor:
@@ -140,7 +140,7 @@ def _linear_layers(
 
 
 def _parameter_obstacles(name: str, policy: TDCPolicy) -> Iterator[str]:
-    """What is unusual about the parameters of a network, its target and its optimizer."""
+    """Yield what is unusual about the parameters of a network, its target and its optimizer."""
     network, target = getattr(policy, name), getattr(policy, f"{name}_target")
     stacks = [_stacks(network), _stacks(target)]
     parameters, targets = ([p for layer in stack or [] for p in (layer.weight, layer.bias)] for stack in stacks)

@@ -90,7 +90,7 @@ class PackedReplay:
         return indices
 
     def _copy_new_rows(self, buffer: ReplayBuffer, steps: int) -> None:
-        """To the device."""
+        """Copy the rows to the device that have been written since the last copy."""
         size = buffer.buffer_size
         if self.steps is None or steps - self.steps != (buffer.pos - self.pos) % size:  # or more than it holds
             self._copy_rows(0, buffer.size(), buffer.n_envs)

@@ -127,7 +127,7 @@ class FusedUpdate:
         return type(None), ()  # and so does one that was pickled
 
     def step(self, lam: float) -> None:
-        """``TDC.update``, on a minibatch of the model's replay buffer"""
+        """Do what ``TDC.update`` does, on a minibatch of the model's replay buffer."""
         model = self.model
         replay_data = self.sample()
         if len(replay_data.rewards) != self.batch_size:  # a custom replay buffer may return fewer than it was asked for
@@ -149,7 +149,7 @@ class FusedUpdate:
         return self.minibatch
 
     def _find_packed_replay(self) -> PackedReplay | None:
-        """The model's replay buffer as rows, where that is possible."""
+        """Return the model's replay buffer as rows, where that is possible."""
         buffer = self.model.replay_buffer
         if self.model._vec_normalize_env is not None:
             return None
@@ -191,7 +191,7 @@ class FusedUpdate:
         return np.tanh(hidden)[None]
 
     def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
-        """``TDC.update_critics``"""
+        """Do what ``TDC.update_critics`` does."""
         model, discounts = self.model, replay_data.discounts
         self.lam.set(lam)
         self.critic_adam.read_learning_rate()
@@ -223,7 +223,7 @@ class FusedUpdate:
             self.smooth(self.model.target_noise_clip)  # Eq. 1
 
     def update_actor(self) -> None:
-        """``TDC.update_actor``, on the observations of the critics' update"""
+        """Do what ``TDC.update_actor`` does, on the observations of the critics' update."""
         model = self.model
         self.actor_adam.read_learning_rate()
         self.actor_adam.show_gradients()
@@ -257,7 +257,7 @@ class FusedUpdate:
         th.mm(self.value.backward(), self.action_weight, out=self.head.action_slope)
 
     def update_targets(self) -> None:
-        """``TDC.update_targets``"""
+        """Do what ``TDC.update_targets`` does."""
         self.run(self._update_targets)
 
     def _update_targets(self) -> None:
