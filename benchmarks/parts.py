@@ -24,7 +24,7 @@ PARTS = {  # name → its place in the model, the method
     "forward pass of the target critics": ("_fused_update.critic_target", "forward"),
     "λ-LCB target": ("_fused_update", "set_target"),
     "forward pass of the critics": ("_fused_update.critic", "forward"),
-    "gradient of the loss": ("_fused_update", "set_loss_slope"),
+    "gradient of the loss": ("_fused_update", "compute_loss_gradient"),
     "backward pass of the critics": ("_fused_update.critic", "backward"),
     "Adam, critics": ("_fused_update.critic_adam", "step"),
     "actor, every second update: passes of actor and first critic": ("_fused_update", "run_actor"),

@@ -91,7 +91,7 @@ def matrix_products(model: Any) -> Callable[[], None]:
             product()
 
     def backward(network: Any) -> None:
-        for product in (*network.weight_products, *network.slope_products):
+        for product in (*network.weight_products, *network.grad_input_products):
             product()
 
     def run() -> None:
@@ -105,7 +105,7 @@ def matrix_products(model: Any) -> Callable[[], None]:
             forward(fused.head.network)
             forward(fused.value)
             backward(fused.value)
-            fused.value.slopes[0] @ fused.action_weight
+            fused.value.grad_outputs[0] @ fused.action_weight
             backward(fused.head.network)
 
     return run

@@ -39,7 +39,7 @@ def _clamp(x, low, high):
 
 
 @_compile
-def _slope(delta, kappa):
+def _huber_derivative(delta, kappa):
     """Return L'_κ(δ)."""
     if kappa > _ZERO:
         return _clamp(delta, -kappa, kappa)
@@ -51,7 +51,7 @@ def quantile_huber_gradient(current, target, gradient, bias_gradient, kappa):
     """
     Compute the gradient of the quantile-Huber loss (Eq. 8–10), and its sum over transitions.
 
-    With c = L'_κ(y_j − z_k), the slope at z_k summed over the targets is ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c).
+    With c = L'_κ(y_j − z_k), the derivative at z_k summed over the targets is ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c).
 
     :param current: (C, B, N), z
     :param target: (B, M), y
@@ -77,13 +77,13 @@ def quantile_huber_gradient(current, target, gradient, bias_gradient, kappa):
             for j in range(0, n_targets - 3, 4):  # four at a time, so that the sums are loaded and stored less often
                 y0, y1, y2, y3 = y[j], y[j + 1], y[j + 2], y[j + 3]
                 for k in range(n_quantiles):
-                    s0, s1 = _slope(y0 - z[k], kappa), _slope(y1 - z[k], kappa)
-                    s2, s3 = _slope(y2 - z[k], kappa), _slope(y3 - z[k], kappa)
+                    s0, s1 = _huber_derivative(y0 - z[k], kappa), _huber_derivative(y1 - z[k], kappa)
+                    s2, s3 = _huber_derivative(y2 - z[k], kappa), _huber_derivative(y3 - z[k], kappa)
                     total[k] += (s0 + s1) + (s2 + s3)
                     size[k] += (abs(s0) + abs(s1)) + (abs(s2) + abs(s3))
             for j in range(n_targets - n_targets % 4, n_targets):
                 for k in range(n_quantiles):
-                    s = _slope(y[j] - z[k], kappa)
+                    s = _huber_derivative(y[j] - z[k], kappa)
                     total[k] += s
                     size[k] += abs(s)
             for k in range(n_quantiles):
@@ -172,19 +172,19 @@ def lcb_target(next_quantiles, rewards, dones, discounts, lam, mean, std, select
 
 
 @_compile
-def tanh_backward(slope, activation, bias_gradient):
+def tanh_backward(grad_output, activation, bias_gradient):
     """
-    Take the slope back through a tanh, in place, and sum it over transitions.
+    Take the gradient at the output of a tanh back through it, in place, and sum it over transitions.
 
-    :param slope: (B, A)
+    :param grad_output: (B, A)
     :param activation: (B, A), the output of the tanh
     :param bias_gradient: (1, A), written
     """
     bias_gradient[:] = _ZERO
-    for b in range(slope.shape[0]):
-        for k in range(slope.shape[1]):
-            s = slope[b, k] * (_ONE - activation[b, k] * activation[b, k])
-            slope[b, k] = s
+    for b in range(grad_output.shape[0]):
+        for k in range(grad_output.shape[1]):
+            s = grad_output[b, k] * (_ONE - activation[b, k] * activation[b, k])
+            grad_output[b, k] = s
             bias_gradient[0, k] += s
 
 
@@ -218,20 +218,20 @@ def smooth_actions(noise, actions, clip):
 
 
 @_compile
-def sample_actions(mean, raw_log_std, noise, spread, actions):
+def sample_actions(mean, raw_log_std, noise, scaled_noise, actions):
     """
     Sample tanh-Gaussian actions (Eq. 21).
 
     :param mean: (B, A); the tanh of the sample is written here too
     :param raw_log_std: (B, A), log σ before it is clipped
     :param noise: (B, A), ε
-    :param spread: (B, A), σ·ε, written
+    :param scaled_noise: (B, A), σ·ε, written
     :param actions: (B, A), written
     """
     for b in range(mean.shape[0]):
         for k in range(mean.shape[1]):
-            spread[b, k] = math.exp(_clamp(raw_log_std[b, k], _LOG_STD_MIN, _LOG_STD_MAX)) * noise[b, k]
-            mean[b, k] = math.tanh(mean[b, k] + spread[b, k])
+            scaled_noise[b, k] = math.exp(_clamp(raw_log_std[b, k], _LOG_STD_MIN, _LOG_STD_MAX)) * noise[b, k]
+            mean[b, k] = math.tanh(mean[b, k] + scaled_noise[b, k])
             actions[b, k] = mean[b, k]
 
 
@@ -256,45 +256,45 @@ def log_density(sample, raw_log_std, noise, log_prob):
 
 @_compile
 def tanh_gaussian_backward(
-    slope, ent_coef, sample, raw_log_std, spread, log_std_slope, mean_bias_gradient, log_std_bias_gradient
+    grad_output, ent_coef, sample, raw_log_std, scaled_noise, grad_log_std, mean_bias_gradient, log_std_bias_gradient
 ):
     """
-    Take the slope back through a tanh-Gaussian sample, adding that of mean(α·log π) (see ``TanhGaussianHead``).
+    Take the gradient back through a tanh-Gaussian sample, adding that of mean(α·log π) (see ``TanhGaussianHead``).
 
-    :param slope: (B, A), at the actions; becomes the slope at the mean
+    :param grad_output: (B, A), at the actions; becomes the gradient at the mean
     :param ent_coef: (1,), α
     :param sample: (B, A), after the tanh
     :param raw_log_std: (B, A)
-    :param spread: (B, A), σ·ε
-    :param log_std_slope: (B, A), written
+    :param scaled_noise: (B, A), σ·ε
+    :param grad_log_std: (B, A), written
     :param mean_bias_gradient: (1, A), written
     :param log_std_bias_gradient: (1, A), written
     """
-    coefficient = ent_coef[0] / np.float32(slope.shape[0])
+    coefficient = ent_coef[0] / np.float32(grad_output.shape[0])
     mean_bias_gradient[:] = _ZERO
     log_std_bias_gradient[:] = _ZERO
-    for b in range(slope.shape[0]):
-        for k in range(slope.shape[1]):
+    for b in range(grad_output.shape[0]):
+        for k in range(grad_output.shape[1]):
             a = sample[b, k]
             squeeze = _ONE - a * a
-            s = (slope[b, k] + _TWO * coefficient * a / (squeeze + _TANH_EPSILON)) * squeeze
-            slope[b, k] = s
+            s = (grad_output[b, k] + _TWO * coefficient * a / (squeeze + _TANH_EPSILON)) * squeeze
+            grad_output[b, k] = s
             mean_bias_gradient[0, k] += s
             inside = _ONE if _LOG_STD_MIN <= raw_log_std[b, k] <= _LOG_STD_MAX else _ZERO
-            t = (s * spread[b, k] - coefficient) * inside
-            log_std_slope[b, k] = t
+            t = (s * scaled_noise[b, k] - coefficient) * inside
+            grad_log_std[b, k] = t
             log_std_bias_gradient[0, k] += t
 
 
 @_compile
-def mean_value(hidden, weight, bias, slope, values):
+def mean_value(hidden, weight, bias, grad_hidden, values):
     """
-    Compute Q₁, the mean of the first critic's quantiles (Eq. 11), and the slope of −mean Q₁ before the last ReLU.
+    Compute Q₁, the mean of the first critic's quantiles (Eq. 11), and the gradient of −mean Q₁ before the last ReLU.
 
     :param hidden: (B, n), after the ReLU
     :param weight: (n, N), of the layer of quantiles
     :param bias: (1, N)
-    :param slope: (B, n), written
+    :param grad_hidden: (B, n), written
     :param values: (B,), written
     """
     batch_size, width = hidden.shape
@@ -314,7 +314,7 @@ def mean_value(hidden, weight, bias, slope, values):
         value = _ZERO
         for k in range(width):
             value += hidden[b, k] * mean_weight[k]
-            slope[b, k] = _ZERO if hidden[b, k] <= _ZERO else share * mean_weight[k]
+            grad_hidden[b, k] = _ZERO if hidden[b, k] <= _ZERO else share * mean_weight[k]
         values[b] = value + mean_bias
 
 

@@ -139,7 +139,7 @@ class QuantileHuberGradient:
     """
     Compute :func:`quantile_huber_gradient` of two preallocated tensors, in closed passes over one small buffer.
 
-    With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the slope of ρ at z_k summed over the targets is
+    With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the derivative of ρ at z_k summed over the targets is
     ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c). Autograd through all pairs would take most of the time of an update.
 
     :param current: (C, B, N), read by each call
@@ -167,9 +167,9 @@ class QuantileHuberGradient:
         """Return (C, B, N), overwritten by the next call."""
         for y, z, delta, total, size in self.chunks:
             th.sub(y, z, out=delta)  # Eq. 8
-            slope = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
-            th.sum(slope, dim=1, out=total)
-            th.sum(slope.abs_(), dim=1, out=size)
+            clamped = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
+            th.sum(clamped, dim=1, out=total)
+            th.sum(clamped.abs_(), dim=1, out=size)
         return self.size.mul_(self.weight).sub_(self.total, alpha=self.scale)
 
 

@@ -338,8 +338,8 @@ class TDC(FusedUpdateAlgorithm):
         current_quantiles = self.critic(replay_data.observations, replay_data.actions)
 
         # Only the gradient of the loss (Eq. 8–10) is needed to learn
-        slope = quantile_huber_gradient(current_quantiles, target.quantiles, self.kappa)
-        self._minimize(current_quantiles, self.critic.optimizer, slope)
+        grad_output = quantile_huber_gradient(current_quantiles, target.quantiles, self.kappa)
+        self._minimize(current_quantiles, self.critic.optimizer, grad_output)
         if self.diagnoses_critics:
             self.diagnose_critics(current_quantiles.detach(), target)
 
@@ -386,9 +386,9 @@ class TDC(FusedUpdateAlgorithm):
         self.diagnose(actor_loss=actor_loss, entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
         if self._learns_ent_coef and self.log_ent_coef.requires_grad:
             # The loss −log α·mean(log π + H_target) is linear in log α
-            slope = -(log_prob + self._current_target_entropy()).mean(dim=0, keepdim=True)
-            self.diagnose(ent_coef_loss=(self.log_ent_coef.detach() * slope).squeeze())
-            self.log_ent_coef.grad = slope
+            gradient = -(log_prob + self._current_target_entropy()).mean(dim=0, keepdim=True)
+            self.diagnose(ent_coef_loss=(self.log_ent_coef.detach() * gradient).squeeze())
+            self.log_ent_coef.grad = gradient
             self.ent_coef_optimizer.step()
 
     def current_ent_coef(self) -> th.Tensor:
@@ -417,15 +417,15 @@ class TDC(FusedUpdateAlgorithm):
     # ---------------------------------------------------------------- optimizers
 
     @staticmethod
-    def _minimize(output: th.Tensor, optimizer: th.optim.Optimizer, slope: th.Tensor | None = None) -> None:
-        """Take one step down a loss: the output, or what has this slope at the output."""
+    def _minimize(output: th.Tensor, optimizer: th.optim.Optimizer, grad_output: th.Tensor | None = None) -> None:
+        """Take one step down a loss: the output itself, or the loss whose gradient at the output is ``grad_output``."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         learning = [parameter for parameter in parameters if parameter.requires_grad]
         for parameter in parameters:
             parameter.grad = None
         # Gradients of these parameters alone: others stay as they are, and cost nothing
         if learning:
-            output.backward(slope, inputs=learning)
+            output.backward(grad_output, inputs=learning)
         optimizer.step()
 
     def _update_learning_rates(self) -> None:

@@ -142,9 +142,9 @@ def replace_a_method_of_the_model(model):
 
 
 def replace_minimize(model):
-    def minimize(output, optimizer, slope=None):
+    def minimize(output, optimizer, grad_output=None):
         CALLS.append("minimize")
-        TDC._minimize(output, optimizer, slope)
+        TDC._minimize(output, optimizer, grad_output)
 
     model._minimize = minimize
 
@@ -496,14 +496,14 @@ def test_sb3s_learning_rate_schedule_is_read(fused):
 
 @pytest.mark.parametrize("fused", [None, False])
 def test_a_target_entropy_changed_in_mid_run_is_read(fused):
-    slopes = []
-    for target in (-100.0, 100.0):  # the slope of log α is −mean(log π + H), on the same samples
+    gradients = []
+    for target in (-100.0, 100.0):  # the gradient of log α is −mean(log π + H), on the same samples
         model = make_model(stochastic_actor=True, fused=fused)
         train(model, 1)
         model.target_entropy = target
         train(model, 2, n=2)
-        slopes.append(model.log_ent_coef.grad.item())
-    assert slopes[0] - slopes[1] == pytest.approx(200)
+        gradients.append(model.log_ent_coef.grad.item())
+    assert gradients[0] - gradients[1] == pytest.approx(200)
     model.target_entropy = "high"
     with pytest.raises(ValueError, match="target_entropy"):
         train(model, 3)

@@ -52,15 +52,15 @@ class Mlp:
     """
     Forward and backward passes of linear layers with ReLU between them.
 
-    Before a backward pass, the caller writes the slope of the loss at the output of the last layer (before a ReLU
-    there) into ``slopes[-1]``, and its sum over transitions into the gradient of that layer's bias.
+    Before a backward pass, the caller writes the gradient of the loss at the output of the last layer (before a
+    ReLU there) into ``grad_outputs[-1]``, and its sum over transitions into the gradient of that layer's bias.
 
     :param layers: of the network
     :param inputs: (B, in), filled before each pass
     :param gradients: where a backward pass writes those of the parameters; None to go without
     :param activate_output: whether there is a ReLU after the last layer too
     :param outputs: buffers for the outputs of the layers
-    :param slopes: buffers for the slopes there; those of passes that are over by then keep the cache small
+    :param grad_outputs: buffers for the gradients of the loss there; those of finished passes keep the cache small
     """
 
     def __init__(
@@ -70,13 +70,13 @@ class Mlp:
         gradients: Sequence[Layer] | None = None,
         activate_output: bool = False,
         outputs: list[th.Tensor] | None = None,
-        slopes: list[th.Tensor] | None = None,
+        grad_outputs: list[th.Tensor] | None = None,
     ):
         stacked = layers[0].weight.shape[:-2]
         if outputs is None:
             outputs = [inputs.new_empty(*stacked, len(inputs), layer.bias.shape[-1]) for layer in layers]
         self.outputs = outputs
-        self.slopes = [th.empty_like(output) for output in outputs] if slopes is None else slopes
+        self.grad_outputs = [th.empty_like(output) for output in outputs] if grad_outputs is None else grad_outputs
         all_inputs = [inputs.expand(*stacked, -1, -1), *outputs[:-1]]
         # Every product and pass with all its tensors, so that none is looked up or viewed again
         self.products = [
@@ -87,20 +87,24 @@ class Mlp:
         if not activate_output:
             self.relus[-1] = None
         self.weight_products: list[Callable[[], Any]] = [
-            partial(gradient.matmul, layer_inputs.mT, slope, out=gradient.weight)
-            for gradient, layer_inputs, slope in zip(gradients or [], all_inputs, self.slopes, strict=bool(gradients))
+            partial(gradient.matmul, layer_inputs.mT, grad_output, out=gradient.weight)
+            for gradient, layer_inputs, grad_output in zip(
+                gradients or [], all_inputs, self.grad_outputs, strict=bool(gradients)
+            )
         ]
-        self.slope_products: list[Callable[[], Any]] = [
-            partial(layer.matmul, slope, layer.transposed, out=slope_below)
-            for layer, slope, slope_below in zip(layers[1:], self.slopes[1:], self.slopes, strict=False)
+        self.grad_input_products: list[Callable[[], Any]] = [
+            partial(layer.matmul, grad_output, layer.transposed, out=grad_input)
+            for layer, grad_output, grad_input in zip(
+                layers[1:], self.grad_outputs[1:], self.grad_outputs, strict=False
+            )
         ]
         self.relu_passes: list[Callable[[], Any]] = [
-            partial(passes.threshold_backward, slope, output, 0, grad_input=slope)
-            for slope, output in zip(self.slopes, outputs, strict=True)
+            partial(passes.threshold_backward, grad_output, output, 0, grad_input=grad_output)
+            for grad_output, output in zip(self.grad_outputs, outputs, strict=True)
         ]
         self.bias_sums: list[Callable[[], Any]] = [
-            partial(th.sum, slope, dim=-2, keepdim=True, out=gradient.bias)
-            for slope, gradient in zip(self.slopes, gradients or [], strict=bool(gradients))
+            partial(th.sum, grad_output, dim=-2, keepdim=True, out=gradient.bias)
+            for grad_output, gradient in zip(self.grad_outputs, gradients or [], strict=bool(gradients))
         ]
 
     def forward(self) -> th.Tensor:
@@ -112,17 +116,17 @@ class Mlp:
         return self.outputs[-1]
 
     def backward(self) -> th.Tensor:
-        """Return the slope at the output of the first layer, before its ReLU."""
-        for i in reversed(range(len(self.slopes))):
+        """Return the gradient of the loss at the output of the first layer, before its ReLU."""
+        for i in reversed(range(len(self.grad_outputs))):
             if self.weight_products:
                 self.weight_products[i]()
             if i > 0:
-                self.slope_products[i - 1]()
+                self.grad_input_products[i - 1]()
                 self.backward_relu(i - 1)
-        return self.slopes[0]
+        return self.grad_outputs[0]
 
     def backward_relu(self, i: int) -> None:
-        """Take the slope at the output of a layer back through its ReLU, and compute the gradient of its bias."""
+        """Take the gradient at the output of a layer back through its ReLU, and compute that of its bias."""
         self.relu_passes[i]()
         if self.bias_sums:
             self.bias_sums[i]()
@@ -148,10 +152,10 @@ class DeterministicHead:
         gradients: Sequence[Layer] | None = None,
     ):
         self.network, self.actions = Mlp(layers, observations, gradients), actions
-        output, self.action_slope = self.network.outputs[-1], self.network.slopes[-1]
+        output, self.grad_actions = self.network.outputs[-1], self.network.grad_outputs[-1]
         self.squash = bind(passes.squash, output, actions)
         if gradients is not None:
-            self.tanh_backward = bind(passes.tanh_backward, self.action_slope, output, gradients[-1].bias)
+            self.tanh_backward = bind(passes.tanh_backward, self.grad_actions, output, gradients[-1].bias)
 
     def act(self) -> th.Tensor:
         """Write and return ``actions``."""
@@ -160,7 +164,7 @@ class DeterministicHead:
         return self.actions
 
     def backward(self) -> None:
-        """Compute the gradients from ``action_slope`` (B, A), that of the loss at the actions."""
+        """Compute the gradients from ``grad_actions`` (B, A), that of the loss at the actions."""
         self.tanh_backward()
         self.network.backward()
 
@@ -193,24 +197,25 @@ class TanhGaussianHead:
         self.network = Mlp(hidden, observations, gradients and gradients[:-2], activate_output=True)
         self.actions = actions
         features = self.network.outputs[-1]
-        mean, raw_log_std, self.noise, spread, log_std_slope, self.action_slope = (
+        mean, raw_log_std, self.noise, scaled_noise, grad_log_std, self.grad_actions = (
             th.empty_like(actions, memory_format=th.contiguous_format) for _ in range(6)
         )
         self.heads = [mean_layer.forward(features, mean), log_std_layer.forward(features, raw_log_std)]
-        self.sample = bind(passes.sample_actions, mean, raw_log_std, self.noise, spread, actions)
+        self.sample = bind(passes.sample_actions, mean, raw_log_std, self.noise, scaled_noise, actions)
         if gradients is None:
             return
         self.log_probs = actions.new_empty(len(actions))
         self.log_density = bind(passes.log_density, mean, raw_log_std, self.noise, self.log_probs)
         at_mean, at_log_std = gradients[-2:]
-        tensors = self.action_slope, ent_coef, mean, raw_log_std, spread, log_std_slope, at_mean.bias, at_log_std.bias
-        self.sample_backward = bind(passes.tanh_gaussian_backward, *tensors)
-        slope = self.network.slopes[-1]
+        read = self.grad_actions, ent_coef, mean, raw_log_std, scaled_noise
+        written = grad_log_std, at_mean.bias, at_log_std.bias
+        self.sample_backward = bind(passes.tanh_gaussian_backward, *read, *written)
+        grad_output = self.network.grad_outputs[-1]
         self.head_products: list[Callable[[], Any]] = [
-            partial(th.mm, features.mT, self.action_slope, out=at_mean.weight),
-            partial(th.mm, features.mT, log_std_slope, out=at_log_std.weight),
-            partial(th.mm, self.action_slope, mean_layer.transposed, out=slope),
-            partial(th.addmm, slope, log_std_slope, log_std_layer.transposed, out=slope),
+            partial(th.mm, features.mT, self.grad_actions, out=at_mean.weight),
+            partial(th.mm, features.mT, grad_log_std, out=at_log_std.weight),
+            partial(th.mm, self.grad_actions, mean_layer.transposed, out=grad_output),
+            partial(th.addmm, grad_output, grad_log_std, log_std_layer.transposed, out=grad_output),
         ]
 
     def act(self) -> th.Tensor:
@@ -228,7 +233,7 @@ class TanhGaussianHead:
         return self.log_probs
 
     def backward(self) -> None:
-        """Compute the gradients from ``action_slope`` (B, A), that of the loss without the entropy at the actions."""
+        """Compute the gradients from ``grad_actions`` (B, A), that of the loss without the entropy at the actions."""
         self.sample_backward()
         for product in self.head_products:
             product()

@@ -94,8 +94,8 @@ def squash(outputs: th.Tensor, actions: th.Tensor) -> None:
     actions.copy_(outputs.tanh_())
 
 
-def tanh_backward(slope: th.Tensor, activation: th.Tensor, bias_gradient: th.Tensor) -> None:
-    th.sum(_tanh_backward(slope, activation, grad_input=slope), dim=0, keepdim=True, out=bias_gradient)
+def tanh_backward(grad_output: th.Tensor, activation: th.Tensor, bias_gradient: th.Tensor) -> None:
+    th.sum(_tanh_backward(grad_output, activation, grad_input=grad_output), dim=0, keepdim=True, out=bias_gradient)
 
 
 def smooth_actions(noise: th.Tensor, actions: th.Tensor, clip: float) -> None:
@@ -103,10 +103,10 @@ def smooth_actions(noise: th.Tensor, actions: th.Tensor, clip: float) -> None:
 
 
 def sample_actions(
-    mean: th.Tensor, raw_log_std: th.Tensor, noise: th.Tensor, spread: th.Tensor, actions: th.Tensor
+    mean: th.Tensor, raw_log_std: th.Tensor, noise: th.Tensor, scaled_noise: th.Tensor, actions: th.Tensor
 ) -> None:
-    th.mul(raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp_(), noise, out=spread)
-    actions.copy_(mean.add_(spread).tanh_())
+    th.mul(raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp_(), noise, out=scaled_noise)
+    actions.copy_(mean.add_(scaled_noise).tanh_())
 
 
 def log_density(sample: th.Tensor, raw_log_std: th.Tensor, noise: th.Tensor, log_prob: th.Tensor) -> None:
@@ -115,27 +115,29 @@ def log_density(sample: th.Tensor, raw_log_std: th.Tensor, noise: th.Tensor, log
 
 
 def tanh_gaussian_backward(
-    slope: th.Tensor,
+    grad_output: th.Tensor,
     ent_coef: th.Tensor,
     sample: th.Tensor,
     raw_log_std: th.Tensor,
-    spread: th.Tensor,
-    log_std_slope: th.Tensor,
+    scaled_noise: th.Tensor,
+    grad_log_std: th.Tensor,
     mean_bias_gradient: th.Tensor,
     log_std_bias_gradient: th.Tensor,
 ) -> None:
-    coefficient, squeeze = ent_coef / len(slope), 1 - sample.square()
-    slope.add_((2 * coefficient) * sample / (squeeze + TANH_EPSILON)).mul_(squeeze)
-    th.sum(slope, dim=0, keepdim=True, out=mean_bias_gradient)
-    th.mul(slope, spread, out=log_std_slope)
-    log_std_slope.sub_(coefficient).mul_((raw_log_std >= LOG_STD_MIN) & (raw_log_std <= LOG_STD_MAX))
-    th.sum(log_std_slope, dim=0, keepdim=True, out=log_std_bias_gradient)
+    coefficient, squeeze = ent_coef / len(grad_output), 1 - sample.square()
+    grad_output.add_((2 * coefficient) * sample / (squeeze + TANH_EPSILON)).mul_(squeeze)
+    th.sum(grad_output, dim=0, keepdim=True, out=mean_bias_gradient)
+    th.mul(grad_output, scaled_noise, out=grad_log_std)
+    grad_log_std.sub_(coefficient).mul_((raw_log_std >= LOG_STD_MIN) & (raw_log_std <= LOG_STD_MAX))
+    th.sum(grad_log_std, dim=0, keepdim=True, out=log_std_bias_gradient)
 
 
-def mean_value(hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, slope: th.Tensor, values: th.Tensor) -> None:
+def mean_value(
+    hidden: th.Tensor, weight: th.Tensor, bias: th.Tensor, grad_hidden: th.Tensor, values: th.Tensor
+) -> None:
     mean_weight = weight.mean(dim=1)
     th.addmv(bias.mean().expand(len(hidden)), hidden, mean_weight, out=values)
-    threshold_backward((mean_weight / -len(hidden)).expand_as(hidden), hidden, 0, grad_input=slope)
+    threshold_backward((mean_weight / -len(hidden)).expand_as(hidden), hidden, 0, grad_input=grad_hidden)
 
 
 def gather(

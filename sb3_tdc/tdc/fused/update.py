@@ -69,8 +69,8 @@ class FusedUpdate:
         batch, bind = self.minibatch, self.bind
         online, target, gradient = self._networks(self.critic_adam)
         self.critic_target = Mlp(target, self.next_inputs)
-        # What was predicted for s' is not needed any more when the slopes are written
-        self.critic = Mlp(online, self.inputs, gradient, slopes=self.critic_target.outputs)
+        # What was predicted for s' is not needed any more when the gradients are written
+        self.critic = Mlp(online, self.inputs, gradient, grad_outputs=self.critic_target.outputs)
 
         next_quantiles, current = self.critic_target.outputs[-1], self.critic.outputs[-1]
         n_critics, batch_size, n_quantiles = next_quantiles.shape
@@ -80,18 +80,18 @@ class FusedUpdate:
         transitions = (batch.rewards, batch.dones, self.discounts.tensor, self.lam.tensor)
         results = (mean, std, selected, self.target.quantiles)
         self.set_target = bind(passes.lcb_target, next_quantiles, *transitions, *results)
-        self.set_loss_slope = bind(
-            passes.quantile_huber_gradient, current, self.target.quantiles, self.critic.slopes[-1], gradient[-1].bias
-        )
+        written = self.critic.grad_outputs[-1], gradient[-1].bias
+        self.compute_loss_gradient = bind(passes.quantile_huber_gradient, current, self.target.quantiles, *written)
 
         # Q₁: the hidden layers of the first critic, then the mean of its quantiles folded into the last layer
         *hidden, last = (layer.first() for layer in online)
-        outputs, slopes = (
-            [buffer[0] for buffer in buffers[: len(hidden)]] for buffers in (self.critic.outputs, self.critic.slopes)
+        outputs, grad_outputs = (
+            [buffer[0] for buffer in buffers[: len(hidden)]]
+            for buffers in (self.critic.outputs, self.critic.grad_outputs)
         )
-        self.value = Mlp(hidden, self.inputs, activate_output=True, outputs=outputs, slopes=slopes)
+        self.value = Mlp(hidden, self.inputs, activate_output=True, outputs=outputs, grad_outputs=grad_outputs)
         self.values = current.new_empty(batch_size)
-        self.set_values = bind(passes.mean_value, outputs[-1], last.weight, last.bias, slopes[-1], self.values)
+        self.set_values = bind(passes.mean_value, outputs[-1], last.weight, last.bias, grad_outputs[-1], self.values)
         self.action_weight = online[0].weight[0, batch.observations.shape[1] :].mT  # (out, A)
 
     def _make_actors(self) -> None:
@@ -212,7 +212,7 @@ class FusedUpdate:
         self.critic_target.forward()  # Eq. 3
         self.set_target()  # Eq. 4–7
         self.critic.forward()
-        self.set_loss_slope(self.model.kappa)  # Eq. 8–10
+        self.compute_loss_gradient(self.model.kappa)  # Eq. 8–10
         self.critic.backward()
         self.critic_adam.step()
 
@@ -237,7 +237,7 @@ class FusedUpdate:
 
     def _update_deterministic_actor(self) -> th.Tensor:
         self.head.act()
-        self._set_value_slope()
+        self._compute_value_gradient()
         self.head.backward()
         self.actor_adam.step()
         return -self.values.mean()  # Eq. 12
@@ -245,16 +245,16 @@ class FusedUpdate:
     def _update_stochastic_actor(self) -> tuple[th.Tensor, th.Tensor]:
         self.head.act()
         log_prob = self.head.log_prob()
-        self._set_value_slope()
+        self._compute_value_gradient()
         self.head.backward()
         self.actor_adam.step()
         return (self.ent_coef * log_prob - self.values).mean(), log_prob  # Eq. 13
 
-    def _set_value_slope(self) -> None:
-        """Compute Q₁ (Eq. 11) of the actions in the inputs, and the slope of −mean Q₁ at these actions."""
+    def _compute_value_gradient(self) -> None:
+        """Compute Q₁ (Eq. 11) of the actions in the inputs, and the gradient of −mean Q₁ at these actions."""
         self.value.forward()
         self.set_values()
-        th.mm(self.value.backward(), self.action_weight, out=self.head.action_slope)
+        th.mm(self.value.backward(), self.action_weight, out=self.head.grad_actions)
 
     def update_targets(self) -> None:
         """Do what ``TDC.update_targets`` does."""
