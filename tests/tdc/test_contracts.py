@@ -3,6 +3,7 @@
 import copy
 import csv
 import functools
+import inspect
 import io
 import json
 import pickle
@@ -626,3 +627,12 @@ def test_it_saves_to_a_stream_what_it_reads_back():
     stream = io.BytesIO()
     make(stochastic_actor=True, ent_coef=0.5).save(stream)
     assert TDC.load(io.BytesIO(stream.getvalue()), ent_coef=0.25).current_ent_coef().item() == 0.25
+
+
+@pytest.mark.parametrize("algorithm", [TDC, MEOW])
+@pytest.mark.parametrize("method", ["learn", "load", "save"])
+def test_methods_take_what_those_of_sb3_take(algorithm, method):
+    own, of_sb3 = (inspect.signature(getattr(cls, method)).parameters for cls in (algorithm, OffPolicyAlgorithm))
+    assert list(own) == list(of_sb3)
+    for name in of_sb3.keys() - {"tb_log_name"}:
+        assert (own[name].default, own[name].kind) == (of_sb3[name].default, of_sb3[name].kind), name
