@@ -94,6 +94,11 @@ class Hyperparams:
     noise_type: str | None = None
     noise_std: float | list[float] = 0.0
 
+    @property
+    def schedules(self) -> list[str]:
+        """The hyperparameters that change with the share of ``n_timesteps`` that is left."""
+        return [name for name, value in self.model.items() if isinstance(value, LinearSchedule)]
+
 
 def hyperparams_file(algo: str) -> Path:
     """Return the file of an algorithm that comes with this package; a variant (``tdc-shift``) has its algorithm's."""

@@ -258,13 +258,19 @@ class RunFolder:
 
     def record_change(self, step: int, config: dict[str, Any], names: tuple[str, ...]) -> None:
         """
-        Keep that hyperparameters are others from a step on.
+        Store hyperparameters that are others from a step on.
 
         :param config: all of them, as they are now
+        :param names: of those that make another experiment of the run, if any
         """
-        change = {"step": step, "hyperparams": {name: config[name] for name in names}}
-        _write_text(self._changes, plain_yaml.dump({"changes": [*self.changes, change]}))
+        if names:
+            change = {"step": step, "hyperparams": {name: config[name] for name in names}}
+            _write_text(self._changes, plain_yaml.dump({"changes": [*self.changes, change]}))
         _write_text(self._config, plain_yaml.dump(config))
+
+    def record_length(self, n_timesteps: int) -> None:
+        """Store in ``args.yml`` that the run is to take another number of steps; ``config.yml`` says it too."""
+        _write_text(self.path / self.env_name / "args.yml", plain_yaml.dump({**self.args, "n_timesteps": n_timesteps}))
 
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
         """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""

@@ -25,6 +25,7 @@ class Role(Enum):
 
     EXPERIMENT = "another value makes another experiment, which is not averaged with this one"
     RUN = "fixed when the run begins"
+    LENGTH = "may be another when the run is resumed, and stays so"
     PROCESS = "may differ each time the run is resumed"
     RESUMING = "said only when a run is resumed"
 
@@ -68,7 +69,8 @@ class RunSettings:
         default=-1,
         minimum=1,
         minus_one="as in the hyperparameters",
-        help="environment steps",
+        role=Role.LENGTH,
+        help="environment steps of the whole run; with --resume, another number makes the run longer or shorter",
     )
     seed: int = setting(
         default=-1, minimum=0, maximum=MAX_SEED, minus_one="a random one", help="seed of all generators"

@@ -12,6 +12,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common import plain_yaml
+from sb3_tdc.common.commands import command
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
@@ -109,9 +110,15 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     """
     folder = RunFolder.open(given["resume"])
     if not (folder.path / folder.env_name / "args.yml").is_file():
-        raise ValueError(f"{folder.path} was stopped before its run began: start it anew")
+        raise ValueError(f"{folder.path} was stopped before its run began: start a new one")
     settings = _resumed_settings(folder, {**given, **_absolute(given)})
+    config, changed = folder.config, dict(given.get("hyperparams", {}))
+    if (length := _new_length(given)) is not None:
+        changed["n_timesteps"] = length
+    differing = {name: value for name, value in changed.items() if name not in config or config[name] != value}
     if folder.is_finished and not settings.start_over:
+        if "n_timesteps" in differing:
+            _refuse_to_prolong(folder, settings, differing["n_timesteps"])
         return None
     if not settings.writes_states:
         raise ValueError(f"{folder.path} has no resume states: it was trained with --resume-freq -1")
@@ -122,12 +129,40 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
             "--start-over begins at step 0 again, and overwrites the results"
         )
     _prepare(settings)
-    where, config = str(folder.path / folder.env_name / "config.yml"), folder.config
-    changed = given.get("hyperparams", {})
-    differing = {name: value for name, value in changed.items() if name not in config or config[name] != value}
+    where = str(folder.path / folder.env_name / "config.yml")
     hyperparams = parse(config, ALGORITHMS[settings.algo], where, differing, _COMMAND_LINE)
+    former_length = folder.n_timesteps if "n_timesteps" in differing else None
     set_random_seed(settings.seed)
-    return TrainingRun(settings, hyperparams, folder, tuple(differing))
+    others = tuple(name for name in differing if name != "n_timesteps")
+    return TrainingRun(settings, hyperparams, folder, others, former_length)
+
+
+def _new_length(given: dict[str, Any]) -> int | None:
+    """
+    Return the steps of the whole run that the command line names, as ``-n`` or among ``-params``, if any.
+
+    :raises ValueError: if it is no integer
+    """
+    if given.get("n_timesteps", -1) != -1:
+        return given["n_timesteps"]
+    named = {name: value for name, value in given.get("hyperparams", {}).items() if name == "n_timesteps"}
+    return convert_mapping(named, {"n_timesteps": int}, _COMMAND_LINE).get("n_timesteps")
+
+
+def _refuse_to_prolong(folder: RunFolder, settings: RunSettings, length: int) -> None:
+    """
+    Refuse another length of a finished run, which has no resume states.
+
+    :raises ValueError: with the command to train its model further
+    """
+    steps = folder.steps_at_end if folder.steps_at_end is not None else folder.steps_of_model()
+    if length <= steps:
+        raise ValueError(f"{folder.path} is finished, at step {steps:,}: n_timesteps {length} adds none")
+    flags = ("--algo", settings.algo, "--env", settings.env, "-i", folder.model, "-n", length - steps)
+    raise ValueError(
+        f"{folder.path} is finished, at step {steps:,}, and a finished run has no resume states: "
+        f"train its model further in a new run, by {command('train', *flags)}"
+    )
 
 
 def _resumed_settings(folder: RunFolder, given: dict[str, Any]) -> RunSettings:
@@ -140,7 +175,7 @@ def _resumed_settings(folder: RunFolder, given: dict[str, Any]) -> RunSettings:
     stored, now = _stored_settings(folder, where), {}
     for declared in fields(RunSettings):
         name, flag = declared.name, flags_of(declared)[-1]
-        if name in given and declared.metadata["role"] in (Role.PROCESS, Role.RESUMING):
+        if name in given and declared.metadata["role"] in (Role.LENGTH, Role.PROCESS, Role.RESUMING):
             now[name] = given[name]
         elif name in given and given[name] != (before := stored.get(name, default_of(declared))):
             said = plain_arguments({"given": given[name], "before": before})

@@ -26,6 +26,7 @@ from sb3_tdc.advb.algorithms import Advised
 from sb3_tdc.common.files import make_numbered, write_atomically
 from sb3_tdc.common.finite import NonFiniteError
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
+from sb3_tdc.common.words import listed
 from sb3_tdc.envs.checked import EnvironmentFaultError, describe_exception
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.processes import closing_envs, ended_processes
@@ -54,12 +55,14 @@ class TrainingRun:
 
     :param folder: which holds the settings and hyperparameters already
     :param changed: hyperparameters that are others from here on, when the run is resumed
+    :param former_length: the steps it was to take before, if it is resumed and ``n_timesteps`` is another now
     """
 
     settings: RunSettings
     hyperparams: Hyperparams
     folder: RunFolder
     changed: tuple[str, ...] = ()
+    former_length: int | None = None
 
     @property
     def is_resumed(self) -> bool:
@@ -174,6 +177,12 @@ def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
 def _announce(run: TrainingRun) -> None:
     verb, settings = "Resuming" if run.is_resumed else "Training", run.settings
     print(f"{verb} {settings.algo} on {settings.env}, seed {settings.seed}, in {run.folder.path}", flush=True)
+    if run.former_length is not None:
+        schedules = run.hyperparams.schedules
+        follow = f"; schedules ({listed(schedules)}) follow the new total" if schedules else ""
+        print(
+            f"The run ends at step {run.hyperparams.n_timesteps:,} now, not {run.former_length:,}{follow}", flush=True
+        )
 
 
 def _warn_of_no_update(model: OffPolicyAlgorithm, n_timesteps: int) -> None:
@@ -248,13 +257,26 @@ def _open_states(run: TrainingRun) -> ResumeStates | None:
 
 
 def _select_state(run: TrainingRun, states: ResumeStates, model: OffPolicyAlgorithm) -> None:
-    """Select the state to resume from, and record hyperparameters that are others from there on."""
-    folder = run.folder
+    """
+    Select the state to resume from, and record hyperparameters that are others from there on.
+
+    :raises ValueError: if there is no such state, or the run was to become shorter than it is already
+    """
+    folder, length = run.folder, run.hyperparams.n_timesteps
     # Whatever has ever been changed is as in config.yml: the state may be older than the change
-    earlier = [name for change in folder.changes for name in change["hyperparams"]]
-    step = states.select(model, run.settings.from_step, [*earlier, *run.changed])
-    if run.changed:
-        folder.record_change(step or 0, run.hyperparams.raw, run.changed)
+    earlier = [name for change in folder.changes for name in change["hyperparams"] if name != "n_timesteps"]
+    step = states.select(model, run.settings.from_step, [*earlier, *run.changed]) or 0
+    if run.former_length is None:
+        if run.changed:
+            folder.record_change(step, run.hyperparams.raw, run.changed)
+        return
+    if length <= step:
+        raise ValueError(f"n_timesteps must be above {step:,}, the step of the resume state, got {length}")
+    # With a schedule, the steps so far are not those of a run of the new length
+    is_another = step > 0 and bool(run.hyperparams.schedules)
+    changed = (*run.changed, "n_timesteps") if is_another else run.changed
+    folder.record_change(step, run.hyperparams.raw, changed)
+    folder.record_length(length)
 
 
 # ---------------------------------------------------------------- environments

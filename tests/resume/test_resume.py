@@ -17,6 +17,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import torch as th
 import yaml
@@ -26,12 +27,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_tdc import TDC
+from sb3_tdc.common import plain_yaml
 from sb3_tdc.resume import LockedError, Restorable, ResumeStates, callback, stored_steps
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.runs import training
 from sb3_tdc.runs.callbacks import busy_machine
 from sb3_tdc.runs.callbacks import stopping as interruption
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
+from sb3_tdc.runs.folder import RunFolder
 from tests.helpers.training import SMALL, fails, outcome, resume, run_train
 from tests.tools import kill
 from tests.tools.runs import Stop, StopAt
@@ -103,6 +106,51 @@ def test_a_finished_run_starts_over(tmp_path, monkeypatch):
     assert outcome(folder) == first
 
 
+@pytest.mark.parametrize("flags", [["-n", "400"], ["-params", "n_timesteps:400"]], ids=" ".join)
+def test_a_run_that_is_made_longer_is_the_run_of_that_length(tmp_path, flags, stop_at, monkeypatch, whole, capsys):
+    stop_at(270)
+    assert run_train(tmp_path, n=300) == 130
+    monkeypatch.undo()
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    stop_at(350)
+    assert resume(folder, *flags) == 130
+    monkeypatch.undo()
+    assert "The run ends at step 400 now, not 300\n" in capsys.readouterr().out
+    assert resume(folder) == 0
+    assert outcome(folder) == whole
+    run = RunFolder.open(folder)
+    assert (run.config["n_timesteps"], run.args["n_timesteps"], run.changes) == (400, 400, [])
+    capsys.readouterr()
+    assert resume(folder) == 0
+    assert capsys.readouterr().out == f"{folder} is finished: there is nothing to resume\n"
+
+
+def test_schedules_follow_the_new_length(stopped, capsys):
+    config = stopped / "Hopper-v4" / "config.yml"
+    config.write_text(plain_yaml.dump({**RunFolder.open(stopped).config, "n_timesteps": 300}))
+    assert resume(stopped, "-n", "320", "-params", "lam:lin_0.5") == 0
+    screen = capsys.readouterr().out
+    assert "The run ends at step 320 now, not 300; schedules (lam) follow the new total" in screen
+    last = pd.read_csv(stopped / "progress.csv").iloc[-1]
+    assert last["train/lam"] == pytest.approx(0.5 * (1 - last["time/total_timesteps"] / 320), abs=0.002)
+    changes = [{"step": 270, "hyperparams": {"lam": "lin_0.5", "n_timesteps": 320}}]
+    assert RunFolder.open(stopped).changes == changes
+
+
+def test_a_finished_run_cannot_be_made_longer(tmp_path, capsys):
+    assert run_train(tmp_path, n=150) == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    error = fails(lambda: resume(folder, "-n", "200"), capsys)
+    assert "is finished, at step 150, and a finished run has no resume states: train its model further" in error
+    assert f"sb3-tdc train --algo tdc --env Hopper-v4 -i {folder / 'Hopper-v4.zip'} -n 50\n" in error
+    assert "n_timesteps 120 adds none" in fails(lambda: resume(folder, "-params", "n_timesteps:120"), capsys)
+    assert resume(folder, "-n", "150") == 0
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+    assert resume(folder, "--start-over", "-n", "160") == 0
+    assert RunFolder.open(folder).steps_at_end == 160
+
+
 def test_a_registered_function_need_not_be_sent_from_its_process(tmp_path, recwarn):
     gym.register("OfAFunction-v0", lambda **kwargs: PendulumEnv(**kwargs), max_episode_steps=50)
     spec = pickle.loads(pickle.dumps(Restorable(gym.make("OfAFunction-v0", max_episode_steps=20)).spec))
@@ -150,7 +198,8 @@ def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
     for args, message in (
         (["--seed", "3"], f"--seed 3 contradicts the run in {stopped}: --seed 1"),
         (["--algo", "sac"], "--algo sac contradicts the run in"),
-        (["-n", "500"], "--n-timesteps 500 contradicts the run in"),
+        (["-n", "270"], "n_timesteps must be above 270, the step of the resume state, got 270"),
+        (["-params", "n_timesteps:many"], "n_timesteps must be an integer, got 'many'"),
         (["-i", "other.zip"], "other.zip contradicts the run in"),
         (["--preset", "parallel"], "--preset parallel contradicts the run in"),
         (["-params", "buffer_size:5"], "buffer_size cannot be changed when a run is resumed; learning_rate, "),
