@@ -10,15 +10,19 @@ from typing import Any, NoReturn
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.checks import suggest, unknown
 from sb3_tdc.common.commands import command
-from sb3_tdc.runs.settings import RunSettings, default_of, flags_of
+from sb3_tdc.runs.settings import Group, RunSettings, default_of, flags_of
+
+# What flags are added to: a parser, or a group of its help
+_Container = argparse._ActionsContainer
 
 
 class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Show defaults, where they are values: of a flag that is not given there is none to show."""
+    """Show defaults that are values and that the help does not name: a flag that is not given has none to show."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         says_nothing = action.default is None or isinstance(action.default, bool) or action.default in ([], {}, "")
-        return action.help if says_nothing else super()._get_help_string(action)
+        is_named = "(default" in (action.help or "")
+        return action.help if says_nothing or is_named else super()._get_help_string(action)
 
 
 class Parser(argparse.ArgumentParser):
@@ -104,7 +108,7 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
     return check
 
 
-def add_trust(parser: Parser) -> None:
+def add_trust(parser: _Container) -> None:
     """Add ``--trust``, of commands that load saved models."""
     help = "let the files run code, as SB3 does: only if you know their origin"
     parser.add_argument("--trust", action="store_true", help=help)
@@ -116,26 +120,33 @@ def warn_about_trust(is_given: bool) -> None:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
 
 
-def add_settings(parser: Parser, names: Iterable[str] = ()) -> None:
+def add_settings(parser: _Container, names: Iterable[str]) -> None:
     """
-    Add the flags of :class:`~sb3_tdc.runs.settings.RunSettings`.
+    Add some of the flags of :class:`~sb3_tdc.runs.settings.RunSettings`.
 
-    :param names: of the settings; all of them by default
+    :param names: of the settings
     """
     names = set(names)
     for declared in fields(RunSettings):
-        if not names or declared.name in names:
+        if declared.name in names:
             _add_setting(parser, declared)
 
 
-def _add_setting(parser: Parser, declared: Field) -> None:
+def add_all_settings(parser: Parser) -> None:
+    """Add the flags of :class:`~sb3_tdc.runs.settings.RunSettings`, in groups."""
+    groups = {group: parser.add_argument_group(group.value) for group in Group}
+    for declared in fields(RunSettings):
+        _add_setting(groups[declared.metadata["group"]], declared)
+
+
+def _add_setting(parser: _Container, declared: Field) -> None:
     flags, options = flags_of(declared), dict(declared.metadata["parsing"])
     kind, default = declared.type, default_of(declared)
     options |= {"dest": declared.name, "default": default, "help": declared.metadata["help"]}
-    group: Any = parser
+    container: Any = parser
     if negation := options.pop("negation", None):
-        group = parser.add_mutually_exclusive_group()
-        group.add_argument(negation[0], dest=declared.name, action="store_false", default=default, help=negation[1])
+        container = parser.add_mutually_exclusive_group()
+        container.add_argument(negation[0], dest=declared.name, action="store_false", default=default, help=negation[1])
     if known := options.pop("known", None):
         options["type"] = one_of(*known)
     elif kind in (bool, bool | None):
@@ -144,4 +155,4 @@ def _add_setting(parser: Parser, declared: Field) -> None:
         options |= {"nargs": "+", "action": KeyValues if isinstance(default, dict) else Names}
     else:
         options["type"] = next(each for each in (int, Path, str) if kind in (each, each | None))
-    group.add_argument(*flags, **options)
+    container.add_argument(*flags, **options)

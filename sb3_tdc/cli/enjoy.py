@@ -62,28 +62,49 @@ def make_parser() -> Parser:
         "Watch a trained agent: in a window where there is a display, with --record where there is none.",
         _ZOO_FLAGS,
     )
-    add = parser.add_argument
+    group = parser.add_argument_group("model")
+    add = group.add_argument
     add("run", nargs="?", type=Path, help="folder of a run, or a zip (else: the run of --algo, --env and --exp-id)")
-    add_settings(parser, ("algo", "env", "log_folder", "num_threads", "device", "gym_packages", "env_kwargs"))
-    add("--exp-id", type=int, default=0, help="number of the run (0: the latest)")
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument("--load-best", action="store_true", help="the best model instead of the last")
-    which.add_argument("--load-checkpoint", type=int, metavar="STEPS", help="the model saved at this step")
-    which.add_argument("--load-last-checkpoint", action="store_true", help="the last model of --save-freq")
-    add("--n-episodes", type=int, default=5, help="episodes to play")
-    add("-n", "--n-timesteps", type=int, default=-1, help="stop after this many steps (-1: no limit)")
-    add("--record", type=Path, metavar="FILE.mp4", help="write a video")
-    add("--explain", action="store_true", help="draw what the critics predict against what follows, next to the model")
-    add("--no-render", action="store_true", help="no picture, only returns")
+    add_settings(group, ("algo", "env", "log_folder", "gym_packages"))
+    add("--exp-id", type=int, default=0, metavar="N", help="number of the run (0: the latest)")
+    which = group.add_mutually_exclusive_group()
+    which.add_argument("--load-best", action="store_true", help="load the best model instead of the last")
+    which.add_argument("--load-checkpoint", type=int, metavar="STEPS", help="load the model saved at this step")
+    which.add_argument("--load-last-checkpoint", action="store_true", help="load the last model of --save-freq")
+    add_trust(group)
+
+    group = parser.add_argument_group("episodes")
+    add = group.add_argument
+    add("--n-episodes", type=int, default=5, metavar="N", help="episodes to play")
+    add(
+        "-n",
+        "--n-timesteps",
+        type=int,
+        default=-1,
+        metavar="STEPS",
+        help="stop after this many steps (default -1: no limit)",
+    )
+    add("--seed", type=int, default=0, help="seed of the environment")
+    add_settings(group, ["env_kwargs"])
     add(
         "--stochastic",
         action="store_true",
-        help="sampled instead of mean actions (SAC, MEOW; TDC always takes the mean)",
+        help="sample actions instead of taking the mean (SAC, MEOW; TDC always takes the mean)",
     )
     add("--board", action="store_true", help="actions of the advisory board (AdvB) instead of those of the actor alone")
-    add("--seed", type=int, default=0, help="seed of the environment")
-    add_trust(parser)
-    add("--verbose", type=int, default=1, help="0: only the result, 1: every episode")
+
+    group = parser.add_argument_group("output")
+    add = group.add_argument
+    add("--record", type=Path, metavar="FILE.mp4", help="write a video")
+    add("--no-render", action="store_true", help="open no window, print returns only")
+    add(
+        "--explain",
+        action="store_true",
+        help="draw the returns that the critics predict against those that follow, into a file next to the model",
+    )
+    add("--verbose", type=int, default=1, metavar="LEVEL", help="0: only the result, 1: every episode")
+
+    add_settings(parser.add_argument_group("process"), ("num_threads", "device"))
     return parser
 
 

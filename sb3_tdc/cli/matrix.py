@@ -23,14 +23,20 @@ def make_parser() -> Parser:
     parser = Parser("matrix", "Train the runs of a figure of the paper; skip finished ones, resume stopped ones.")
     add = parser.add_argument
     add("suite", type=one_of("suite", [*SUITES, "all"]), help=f"{', '.join(SUITES)}, or all of the paper's")
-    add("--seeds", type=int, nargs="+", default=[5], help="how many (one number), or which (several)")
-    add("--scale", type=float, default=1.0, help="fraction of the suite's steps")
-    add("--only", nargs="+", action=Names, default=[], metavar="NAME", help="algorithms and environments")
+    add(
+        "--seeds", type=int, nargs="+", default=[5], metavar="N", help="number of seeds, or the seeds (several numbers)"
+    )
+    add("--scale", type=float, default=1.0, help="fraction of the suite's environment steps")
+    add("--only", nargs="+", action=Names, default=[], metavar="NAME", help="algorithms and environments to train")
     add("--logs", type=Path, default=Path("logs"), help="folder of all runs")
     add("--results", type=Path, default=RESULTS, help="folder of published results: runs that are there are skipped")
-    add("--jobs", type=int, help="runs at once (default: one a core)")
-    add("--address", help="of a Ray cluster that shares this file system (default: this machine)")
-    add("--dry-run", action="store_true", help="say what would be run, and how long it would take")
+    add("--jobs", type=int, metavar="N", help="runs at once (default: one for each core)")
+    add(
+        "--address",
+        metavar="HOST:PORT",
+        help="address of a Ray cluster that shares this file system (default: this machine)",
+    )
+    add("--dry-run", action="store_true", help="print what would be run, and how long it would take")
     return parser
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import timedelta
 
 from sb3_tdc.ablations import know_ablations
-from sb3_tdc.cli.arguments import Parser, add_settings, warn_about_trust
+from sb3_tdc.cli.arguments import Parser, add_all_settings, warn_about_trust
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.finite import NonFiniteError
 from sb3_tdc.common.output import harmless_output, warnings_as_sentences
@@ -46,7 +46,7 @@ def make_parser() -> Parser:
     parser = Parser(
         "train", "Train an agent. Hyperparameters come from hyperparams/<algo>.yml, as in RL Zoo.", _ZOO_FLAGS
     )
-    add_settings(parser)
+    add_all_settings(parser)
     return parser
 
 

@@ -35,25 +35,34 @@ def make_parser() -> Parser:
     add = parser.add_argument
     add_settings(parser, ["algo", "env", "gym_packages", "hyperparams"])
     parser.set_defaults(env="Hopper-v4")
-    add("-n", "--n-timesteps", type=int, default=100_000, help="environment steps of a trial")
-    add("--seeds", type=int, default=3, help="seeds of each candidate: 1, 2, ...")
+    add("-n", "--n-timesteps", type=int, default=100_000, metavar="STEPS", help="environment steps of a trial")
+    add("--seeds", type=int, default=3, metavar="N", help="number of seeds of each candidate: 1, 2, ..., N")
     add(
         "--search",
         nargs="+",
         default=[],
         metavar="KEY:VALUES",
-        help='such as "lam:[0.5,1.0]" "tau:loguniform(1e-4,1e-2)"',
+        help='hyperparameters to search, e.g. "lam:[0.5,1.0]" "tau:loguniform(1e-4,1e-2)"',
     )
-    add("--samples", type=int, default=10, help="draws of the distributions in --search")
+    add("--samples", type=int, default=10, metavar="N", help="candidates to draw from the distributions in --search")
     add("--asha", action="store_true", help="stop the worse two thirds of the candidates early, twice")
-    add("--logs", type=Path, default=Path("logs"), help="folder of all searches")
-    add("--jobs", type=int, help="CPUs to use (default: all cores); a trial takes one, with --asha one a seed")
-    add("--address", help="of a Ray cluster that shares this file system (default: this machine)")
+    add("--logs", type=Path, default=Path("logs"), metavar="FOLDER", help="folder of all searches")
+    add(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="CPUs to use (default: all cores); a trial takes one, with --asha one for each seed",
+    )
+    add(
+        "--address",
+        metavar="HOST:PORT",
+        help="address of a Ray cluster that shares this file system (default: this machine)",
+    )
     add(
         "--resume",
         type=Path,
         metavar="FOLDER",
-        help="continue a stopped search; its folder holds the other arguments",
+        help="continue an interrupted search; its folder holds the other arguments",
     )
     return parser
 

@@ -1,5 +1,5 @@
 """
-What a run is told besides its hyperparameters, declared once.
+What a run is told apart from its hyperparameters, declared once.
 
 The flags of ``sb3-tdc train``, the run's ``args.yml``, what may change when a run is resumed, and what the report
 compares all come from :class:`RunSettings`.
@@ -30,10 +30,21 @@ class Role(Enum):
     RESUMING = "said only when a run is resumed"
 
 
+class Group(Enum):
+    """Where a setting's flag is shown in the help."""
+
+    RUN = "run"
+    HYPERPARAMETERS = "hyperparameters"
+    EVALUATION = "evaluation"
+    SAVING = "saving and resuming"
+    PROCESS = "process and log"
+
+
 def setting(  # type: ignore[no-untyped-def]
     *flags: str,
     default: Any,
     help: str,
+    group: Group,
     role: Role = Role.RUN,
     minimum: int | None = None,
     maximum: float = math.inf,
@@ -44,6 +55,7 @@ def setting(  # type: ignore[no-untyped-def]
     Declare a setting.
 
     :param flags: on the command line; the name of the setting is the first by default
+    :param group: of flags, in the help
     :param minimum: the smallest number allowed
     :param maximum: the largest
     :param minus_one: what -1 means; None if it is not allowed
@@ -51,8 +63,8 @@ def setting(  # type: ignore[no-untyped-def]
     :return: a field of a dataclass
     """
     limits = {"minimum": minimum, "maximum": maximum, "minus_one": minus_one}
-    help += f" (-1: {minus_one})" if minus_one else ""
-    metadata = {"flags": flags, "help": help, "role": role, **limits, "parsing": parsing}
+    help += f" ({'default ' if default == -1 else ''}-1: {minus_one})" if minus_one else ""
+    metadata = {"flags": flags, "help": help, "group": group, "role": role, **limits, "parsing": parsing}
     if isinstance(default, (dict, list)):
         return field(default_factory=default.copy, metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -62,106 +74,191 @@ def setting(  # type: ignore[no-untyped-def]
 class RunSettings:
     """Every setting with its flag, its default and what depends on it."""
 
-    algo: str = setting(default="tdc", help="algorithm: " + ", ".join(ALGORITHMS), known=("algorithm", ALGORITHMS))
-    env: str = setting(default="HalfCheetah-v4", help="environment id")
+    algo: str = setting(
+        default="tdc", help="algorithm: " + ", ".join(ALGORITHMS), group=Group.RUN, known=("algorithm", ALGORITHMS)
+    )
+    env: str = setting(default="HalfCheetah-v4", group=Group.RUN, help="environment id")
     n_timesteps: int = setting(
         *("-n", "--n-timesteps"),
         default=-1,
         minimum=1,
         minus_one="as in the hyperparameters",
         role=Role.LENGTH,
-        help="environment steps of the whole run; with --resume, another number makes the run longer or shorter",
+        group=Group.RUN,
+        metavar="STEPS",
+        help="environment steps of the whole run; with --resume, a new total",
     )
     seed: int = setting(
-        default=-1, minimum=0, maximum=MAX_SEED, minus_one="a random one", help="seed of all generators"
+        default=-1,
+        minimum=0,
+        maximum=MAX_SEED,
+        minus_one="a random one",
+        group=Group.RUN,
+        help="seed of all random generators",
     )
-    log_folder: str = setting("-f", "--log-folder", "--folder", default="logs", help="folder of all runs")
-    gym_packages: list[str] = setting(default=[], help="packages to import, which register environments")
-    env_kwargs: dict[str, Any] = setting(default={}, role=Role.EXPERIMENT, help="key:value of the environment")
+    log_folder: str = setting(
+        "-f", "--log-folder", "--folder", default="logs", group=Group.RUN, metavar="FOLDER", help="folder of all runs"
+    )
+    gym_packages: list[str] = setting(
+        default=[],
+        group=Group.RUN,
+        metavar="PACKAGE",
+        help="packages that register environments, imported first",
+    )
+    env_kwargs: dict[str, Any] = setting(
+        default={},
+        role=Role.EXPERIMENT,
+        group=Group.RUN,
+        metavar="KEY:VALUE",
+        help="keyword arguments of the environment, e.g. max_episode_steps:500",
+    )
     eval_env_kwargs: dict[str, Any] = setting(
-        default={}, role=Role.EXPERIMENT, help="key:value of the evaluation environment"
+        default={},
+        role=Role.EXPERIMENT,
+        group=Group.EVALUATION,
+        metavar="KEY:VALUE",
+        help="keyword arguments of the evaluation environment, if they differ from --env-kwargs",
     )
     vec_env: str = setting(
         default="dummy",
+        group=Group.RUN,
         choices=["dummy", "subproc", "gymnasium"],
-        help="environments in this process, in their own, or of gymnasium.make_vec",
+        help="dummy: in this process; subproc: one process each; gymnasium: gymnasium.make_vec",
     )
     hyperparams: dict[str, Any] = setting(
-        "-params", "--hyperparams", default={}, role=Role.RESUMING, help="key:value over the hyperparameters"
+        *("-params", "--hyperparams"),
+        default={},
+        role=Role.RESUMING,
+        group=Group.HYPERPARAMETERS,
+        metavar="KEY:VALUE",
+        help="override hyperparameters, e.g. lam:0.5 learning_rate:3.0e-4",
     )
     conf_file: Path | None = setting(
-        "-conf", "--conf-file", default=None, help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)"
+        *("-conf", "--conf-file"),
+        default=None,
+        group=Group.HYPERPARAMETERS,
+        metavar="FILE.yml",
+        help="file of hyperparameters (default: hyperparams/<algo>.yml)",
     )
     preset: str | None = setting(
-        default=None, help="entry of that file instead of the environment's (parallel: for thousands of environments)"
+        default=None,
+        group=Group.HYPERPARAMETERS,
+        metavar="NAME",
+        help="entry of that file to take instead of the environment's (parallel: for thousands of environments)",
     )
     trained_agent: Path | None = setting(
-        "-i",
-        "--trained-agent",
+        *("-i", "--trained-agent"),
         default=None,
         role=Role.EXPERIMENT,
-        help="zip of a model to train further in a new run",
+        group=Group.SAVING,
+        metavar="MODEL.zip",
+        help="train a saved model further, in a new run",
     )
-    trust: bool = setting(default=False, help="let the files of -i run code, as SB3 does")
+    trust: bool = setting(
+        default=False,
+        group=Group.SAVING,
+        help="let the files of -i run code, as SB3 does: only if you know their origin",
+    )
     eval_freq: int = setting(
         default=20_000,
         minimum=0,
         minus_one="none, as 0",
         role=Role.EXPERIMENT,
+        group=Group.EVALUATION,
+        metavar="STEPS",
         help="environment steps between evaluations",
     )
-    eval_episodes: int = setting(default=5, minimum=1, role=Role.EXPERIMENT, help="episodes per evaluation")
-    n_eval_envs: int = setting(default=1, minimum=1, help="environments for evaluation")
-    save_freq: int = setting(
-        default=-1, minimum=0, minus_one="only at the end, as 0", help="environment steps between saved models"
+    eval_episodes: int = setting(
+        default=5, minimum=1, role=Role.EXPERIMENT, group=Group.EVALUATION, metavar="N", help="episodes per evaluation"
     )
-    save_replay_buffer: bool = setting(default=False, help="save the replay buffer with the model")
+    n_eval_envs: int = setting(
+        default=1, minimum=1, group=Group.EVALUATION, metavar="N", help="environments that an evaluation plays at once"
+    )
+    save_freq: int = setting(
+        default=-1,
+        minimum=0,
+        minus_one="only at the end, as 0",
+        group=Group.SAVING,
+        metavar="STEPS",
+        help="environment steps between saved models",
+    )
+    save_replay_buffer: bool = setting(
+        default=False, group=Group.SAVING, help="save the replay buffer with every saved model"
+    )
     resume_freq: int | None = setting(
         default=None,
         minimum=1,
         minus_one="none",
-        help=f"environment steps between resume states, by default {DEFAULT_FREQ:,} or, if more, 100 an environment",
+        group=Group.SAVING,
+        metavar="STEPS",
+        help=f"environment steps between resume states (default: {DEFAULT_FREQ:,}, or 100 for each environment "
+        "if that is more)",
     )
     resume: Path | None = setting(
         default=None,
         role=Role.RESUMING,
+        group=Group.SAVING,
         metavar="RUN_FOLDER",
-        help="continue a stopped run; its folder holds the other arguments",
+        help="continue an interrupted run; its folder holds the other arguments",
     )
     from_step: int | None = setting(
         "--from",
         default=None,
         minimum=0,
         role=Role.RESUMING,
+        group=Group.SAVING,
         metavar="STEP",
-        help="with --resume: continue from the state of a step",
+        help="with --resume: continue from the resume state of this step",
     )
     start_over: bool = setting(
-        default=False, role=Role.RESUMING, help="with --resume: begin at step 0 again, and overwrite the results"
+        default=False,
+        role=Role.RESUMING,
+        group=Group.SAVING,
+        help="with --resume: start again at step 0, and overwrite the results",
     )
     tensorboard_log: str | None = setting(
-        "-tb", "--tensorboard-log", default=None, help='TensorBoard folder (none given: the run\'s own; "": off)'
+        *("-tb", "--tensorboard-log"),
+        default=None,
+        group=Group.PROCESS,
+        metavar="FOLDER",
+        help='folder of TensorBoard files (default: the run\'s folder; "": none)',
     )
     log_interval: int = setting(
         default=-1,
         minimum=0,
         minus_one="4, or the number of environments if that is larger",
+        group=Group.PROCESS,
+        metavar="EPISODES",
         help="episodes between log entries, 0 for no log",
     )
-    uuid: bool = setting("-uuid", "--uuid", default=False, help="a unique name for the run folder")
+    uuid: bool = setting("-uuid", "--uuid", default=False, group=Group.RUN, help="add a UUID to the run folder's name")
     num_threads: int = setting(
-        default=-1, minimum=1, minus_one="at most two", role=Role.PROCESS, help="threads for PyTorch"
+        default=-1,
+        minimum=1,
+        minus_one="at most two",
+        role=Role.PROCESS,
+        group=Group.PROCESS,
+        metavar="N",
+        help="threads of PyTorch",
     )
-    device: str = setting(default="auto", role=Role.PROCESS, help="PyTorch device (cpu, cuda, ...)")
+    device: str = setting(
+        default="auto", role=Role.PROCESS, group=Group.PROCESS, help="PyTorch device: auto, cpu, cuda, cuda:1, ..."
+    )
     progress: bool | None = setting(
         *("-P", "--progress"),
         default=None,
         role=Role.PROCESS,
-        help="a progress bar (on a terminal: default)",
-        negation=("--no-progress", "plain lines, also on a terminal"),
+        group=Group.PROCESS,
+        help="show a progress bar (default on a terminal)",
+        negation=("--no-progress", "print plain lines, also on a terminal"),
     )
     verbose: int = setting(
-        default=1, minimum=0, role=Role.PROCESS, help="0: silent, 1: progress, 2: also SB3's tables and messages"
+        default=1,
+        minimum=0,
+        role=Role.PROCESS,
+        group=Group.PROCESS,
+        metavar="LEVEL",
+        help="0: silent, 1: progress, 2: also SB3's tables and messages",
     )
 
     @property

@@ -653,7 +653,15 @@ def test_help_shows_defaults_that_are_values_alone(make_parser):
     text = make_parser().format_help()
     shown = {" ".join(default.split()) for default in re.findall(r"\(default:\s+(.*?)\)", text, re.DOTALL)}
     assert {"tdc", "logs", "HalfCheetah-v4"} <= shown
-    assert not shown & {"None", "True", "False", "[]", "{}"}
+    assert not shown & {"None", "True", "False", "[]", "{}", "-1"}
+
+
+def test_the_help_of_train_is_in_groups(capsys):
+    with pytest.raises(SystemExit):
+        train.main(["--help"])
+    text = capsys.readouterr().out
+    titles = ["run", "hyperparameters", "evaluation", "saving and resuming", "process and log"]
+    assert re.findall(r"^([a-z ]+):$", text, re.MULTILINE) == ["options", *titles]
 
 
 def test_a_ctrl_c_before_training_begins_ends_with_130_and_leaves_nothing(tmp_path, capsys):
