@@ -14,6 +14,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_tdc.common.playing import play_steps
 from sb3_tdc.critics.returns import discounted_returns, known_steps
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import mean_and_std, quantile_midpoints, select_critic
@@ -251,13 +252,14 @@ def record_episodes(model: TDC, env: VecEnv, n_episodes: int, limit: int | None 
     """
     recording = Recording(model)
     episodes: list[Episode] = []
-    observation: Any = env.reset()
-    while len(episodes) < n_episodes:
-        action, _ = model.predict(observation, deterministic=True)
-        single = {k: v[0] for k, v in observation.items()} if isinstance(observation, dict) else observation[0]
-        observation, rewards, dones, infos = env.step(action)
-        recording.add(single, action[0], float(rewards[0]))
-        if dones[0]:
-            episodes.append(recording.finish(not infos[0].get("TimeLimit.truncated", False), limit))
+    for step in play_steps(model, env):
+        seen = step.observation
+        recording.add(
+            {k: v[0] for k, v in seen.items()} if isinstance(seen, dict) else seen[0], step.action, step.reward
+        )
+        if step.done:
+            episodes.append(recording.finish(not step.info.get("TimeLimit.truncated", False), limit))
             recording.start()
+        if len(episodes) == n_episodes:
+            break
     return episodes

@@ -12,8 +12,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_tdc.envs.checked import describe_exception
+from sb3_tdc.envs.registry import is_of_mujoco
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".mkv", ".mov", ".avi")
 _GL_BACKENDS = ("egl", "osmesa")
@@ -106,6 +109,39 @@ def follow_agent(env: gym.Env) -> None:
         renderer.default_cam_config = {**tracking, **(renderer.default_cam_config or {})}
 
 
+def choose_render_mode(
+    env_id: str, env_kwargs: dict[str, Any], record: bool = False, window: bool = True
+) -> tuple[dict[str, Any], list[str]]:
+    """
+    Decide what is drawn; MuJoCo's backend is chosen before it is imported.
+
+    :param env_kwargs: what the environment is made with anyway; a ``render_mode`` there is one that it needs
+    :param record: whether pictures are wanted
+    :param window: whether a window is wanted, if no pictures are
+    :return: the ``render_mode`` to add to its arguments, if any, and sentences on what is drawn or is not
+    :raises ValueError: if it cannot be recorded
+    """
+    needed, modes = env_kwargs.get("render_mode"), render_modes(env_id)
+    wanted = "rgb_array" if record else "human" if window else None
+    said = []
+    why = f"it is made with render_mode {needed}"
+    possible = {needed} if needed is not None else modes | ({"human"} if "rgb_array" in modes else set())
+    if needed is None:
+        why = f"it draws {', '.join(sorted(modes)) or 'nothing'}"
+    if wanted == "rgb_array" and wanted not in possible:
+        raise ValueError(f"{env_id} cannot be recorded: {why}")
+    if wanted == "human" and wanted not in possible:
+        said.append(f"No window: {why}" + (". To see the agent: --record FILE.mp4" if "rgb_array" in possible else ""))
+        wanted = None
+    if wanted == "human" and not display_works():
+        said.append("There is no display: no window. To see the agent: --record FILE.mp4")
+        wanted = None
+    drawn = needed or wanted
+    if drawn is not None and is_of_mujoco(env_id):
+        said.append(choose_gl_backend(drawn == "human"))
+    return {} if needed is not None or drawn is None else {"render_mode": drawn}, said
+
+
 class VideoWriter:
     """
     A context that writes frames to a video file.
@@ -146,6 +182,30 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.writer.close()
+
+
+class Filmed(VecEnvWrapper):
+    """
+    Write a frame to a video before every step.
+
+    :param venv: one environment, made with ``render_mode="rgb_array"``
+    """
+
+    def __init__(self, venv: VecEnv, video: VideoWriter):
+        super().__init__(venv)
+        self.video = video
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        frame = self.venv.render()
+        assert frame is not None
+        self.video.add(frame)
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        return self.venv.step_wait()
 
 
 def _timing_of_gif(fps: float) -> tuple[int, int]:

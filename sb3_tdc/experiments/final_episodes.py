@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.files import check_writable, write_atomically
+from sb3_tdc.common.playing import play_episodes
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.runs.trained import open_run
 
@@ -32,13 +33,7 @@ def play_final_episodes(model: BaseAlgorithm, env: VecEnv, episodes: int, first_
     returns = np.empty(episodes)
     for episode in range(episodes):
         env.seed(first_seed + episode)
-        observation: Any = env.reset()
-        done = False
-        while not done:
-            action, _ = model.predict(observation, deterministic=True)
-            observation, _, dones, infos = env.step(action)
-            done = dones[0]
-        returns[episode] = infos[0]["episode"]["r"]
+        returns[episode] = next(play_episodes(model, env)).total
     return returns
 
 

@@ -30,7 +30,8 @@ class TrainedModel:
     :param path: the zip
     :param env_id: registered
     :param hyperparams: those that environments are made of
-    :param env_kwargs: of training; :param eval_env_kwargs: of evaluations, where these differ
+    :param env_kwargs: of training
+    :param eval_env_kwargs: of evaluations, where these differ
     :param normalization: saved statistics of ``VecNormalize``, if it was trained with them
     :param trust: whether its files may run code
     :param vec_env: "gymnasium" if it was trained in the vector environment that is registered for the id, else "dummy"
@@ -78,6 +79,37 @@ class TrainedModel:
         :raises ValueError: if it is refused, or is of another algorithm
         """
         return load_model(self.path, self.algo, env, self.trust, device=device, buffer_size=1)
+
+
+def find_model(
+    run: RunFolder, best: bool = False, checkpoint: int | None = None, last_checkpoint: bool = False
+) -> Path:
+    """
+    Find one of a run's models: the last one by default.
+
+    :param best: the best one instead
+    :param checkpoint: the one that was saved at this step instead
+    :param last_checkpoint: the last one that was saved during training instead
+    :return: the zip
+    :raises ValueError: if there is none, with what there is
+    """
+    checkpoints = run.checkpoints()
+    if best:
+        path = run.best_model
+    elif checkpoint is not None or last_checkpoint:
+        steps = checkpoint if checkpoint is not None else max(checkpoints, default=-1)
+        if steps not in checkpoints:
+            known = f"there are those of steps {', '.join(map(str, checkpoints))}" if checkpoints else "it has none"
+            raise ValueError(
+                f"{run.path} has no saved model of step {steps}; {known} (sb3-tdc train --save-freq makes them)"
+            )
+        path = checkpoints[steps]
+    else:
+        path = run.model
+    if not path.is_file():
+        others = [p.name for p in (run.model, run.best_model, *checkpoints.values()) if p.is_file()]
+        raise ValueError(f"{path} does not exist; in its folder are: {', '.join(others) or 'no models'}")
+    return path
 
 
 def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: bool = False) -> TrainedModel:

@@ -1,13 +1,20 @@
 """Which model ``enjoy`` takes, and what it does not take silently."""
 
+import re
 import shutil
+from contextlib import nullcontext
 
 import gymnasium as gym
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_tdc.advb import AdvBTD3
 from sb3_tdc.cli import enjoy
-from tests.helpers.command_line import SMALL, run_enjoy, run_train
+from sb3_tdc.common.playing import play_episodes
+from tests.helpers.command_line import SMALL, SMALL_ANY, run_enjoy, run_train
+from tests.helpers.training import fails
 
 
 @pytest.fixture(scope="module")
@@ -75,11 +82,31 @@ def test_one_episode_is_one(run, capsys):
     assert capsys.readouterr().out.endswith("± 0.00 (mean ± std of 1 episode)\n")
 
 
+def test_a_board_acts_as_in_predict_unless_it_is_left_out(run, tmp_path, capsys):
+    assert run_train(tmp_path, "--verbose", 0, algo="advb_td3", env="Pendulum-v1", n=410, small=SMALL_ANY) == 0
+    advised = tmp_path / "advb_td3" / "Pendulum-v1_1"
+    model = AdvBTD3.load(advised / "Pendulum-v1.zip")
+    assert len(model.policy.board) > 0
+    returns = {}
+    for flags in ([], ["--actor-alone"]):
+        capsys.readouterr()
+        assert run_enjoy(advised, *flags) == 0
+        (returns["alone" if flags else "board"],) = re.findall(r"Episode   1: return +(\S+),", capsys.readouterr().out)
+    env = DummyVecEnv([lambda: Monitor(gym.make("Pendulum-v1"))])
+    for who, acting in (("board", nullcontext()), ("alone", model.policy.actor_alone())):
+        env.seed(0)
+        with acting:
+            assert f"{next(play_episodes(model, env)).total:.2f}" == returns[who]
+    assert returns["board"] != returns["alone"]
+    assert "--actor-alone is for models of advb_td3, advb_sac and advb_tdc" in fails(
+        lambda: run_enjoy(run, "--actor-alone"), capsys
+    )
+
+
 def test_the_critics_of_advb_tdc_are_explained_too(tmp_path, capsys):
     assert run_train(tmp_path, "--verbose", 0, algo="advb_tdc", env="Pendulum-v1", n=210, small=SMALL) == 0
     run = tmp_path / "advb_tdc" / "Pendulum-v1_1"
     capsys.readouterr()
-    assert "leave out --board" in refused(capsys, run, "--explain", "--board")
     assert enjoy.main([str(run), "--explain", "--n-episodes", "1"]) == 0
     assert (run / "Pendulum-v1_critics.png").stat().st_size > 10_000
 

@@ -1,6 +1,5 @@
 """Pictures without a display."""
 
-import argparse
 import os
 import subprocess
 import sys
@@ -144,7 +143,7 @@ def runs(tmp_path_factory):
     ],
 )
 def test_every_environment_can_be_played(runs, name, said, monkeypatch, capsys):
-    monkeypatch.setattr(enjoy, "display_works", lambda: False)
+    monkeypatch.setattr(rendering, "display_works", lambda: False)
     assert enjoy.main([str(runs[name]), "--n-episodes", "2"]) == 0
     out = capsys.readouterr().out
     assert said in out
@@ -220,5 +219,4 @@ def test_a_display_that_is_gone_is_not_used(monkeypatch):
     monkeypatch.setattr(rendering, "_TRY_BACKEND", "import os; raise SystemExit(os.environ['MUJOCO_GL'] != 'osmesa')")
     assert rendering.choose_gl_backend() == "Rendering with MUJOCO_GL=osmesa (no display)"
     assert os.environ.pop("MUJOCO_GL") == "osmesa"
-    args = argparse.Namespace(record=None, no_render=False)
-    assert enjoy._rendering(args, "Hopper-v4", {}) == {}
+    assert rendering.choose_render_mode("Hopper-v4", {})[0] == {}
