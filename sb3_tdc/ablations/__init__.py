@@ -13,7 +13,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_tdc.ablations.calibration import MAX_LAM, CalibratedTDC
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.off_policy import discounts_of
 from sb3_tdc.common.saved_fields import SavedField, number
 from sb3_tdc.tdc import TDC
@@ -78,8 +77,3 @@ ABLATIONS: dict[str, type[OffPolicyAlgorithm]] = {
     "tdc-pessimism": PessimisticTDC,
     "tdc-kappa": ScaledKappaTDC,
 }
-
-
-def know_ablations() -> None:
-    """Let the commands know the variants by name."""
-    ALGORITHMS.update(ABLATIONS)

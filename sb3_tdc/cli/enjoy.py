@@ -14,9 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tdc.ablations import know_ablations
 from sb3_tdc.advb.policies import AdvisedPolicy
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.playing import play_episodes
@@ -25,6 +23,7 @@ from sb3_tdc.common.words import count
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.registry import import_packages, split_env_id
 from sb3_tdc.envs.rendering import VIDEO_SUFFIXES, Filmed, VideoWriter, choose_render_mode, follow_agent
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.explaining import explain, explanation_path, extend_time_limit
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import MAX_SEED, RunSettings, check_settings
@@ -163,8 +162,8 @@ def _check_explainable(args: argparse.Namespace, trained: TrainedModel) -> None:
 
     :raises ValueError: if there is nothing to explain, or an argument has no meaning with ``--explain``
     """
-    if not issubclass(ALGORITHMS[trained.algo], TDC):
-        known = " or ".join(name for name, algorithm in ALGORITHMS.items() if issubclass(algorithm, TDC))
+    if not issubclass(KNOWN_ALGORITHMS[trained.algo], TDC):
+        known = " or ".join(name for name, algorithm in KNOWN_ALGORITHMS.items() if issubclass(algorithm, TDC))
         raise ValueError(f"--explain needs a model of {known}: the critics of {trained.algo} predict no distribution")
     for name in ("record", "stochastic"):
         if getattr(args, name):
@@ -275,7 +274,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, or 1 if the environment failed
     """
-    know_ablations()
     parser = make_parser()
     args, given = parser.parse_args(argv), parser.parse_given(argv)
     try:

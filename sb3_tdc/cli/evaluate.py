@@ -4,7 +4,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser, add_settings, add_trust, warn_about_trust
 from sb3_tdc.common.words import count
 from sb3_tdc.experiments.final_episodes import EPISODES, measure_run
@@ -18,7 +17,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, or 1 if a run could not be tested
     """
-    know_ablations()
     parser = Parser("evaluate", "Play test episodes with every finished run; what has been played is not played again.")
     parser.add_argument("logs", type=Path, help="folder of runs")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="episodes for each run")

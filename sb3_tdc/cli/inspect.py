@@ -4,10 +4,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.ablations import know_ablations
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, one_of
 from sb3_tdc.common.untrusted import escaped
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load.inspect import inspect
 from sb3_tdc.safe_load.run_files import check_arguments, check_imports
@@ -32,7 +31,7 @@ def inspect_run(path: Path) -> tuple[list[str], bool]:
         lines, is_good = [*lines, f"Refused: {escaped(str(error))}"], False
     for model in [model for model in (run.model, run.best_model) if model.exists()]:
         try:
-            described, opens = inspect(model, ALGORITHMS.get(str(run.args.get("algo"))))
+            described, opens = inspect(model, KNOWN_ALGORITHMS.get(str(run.args.get("algo"))))
         except ValueError as error:
             described, opens = [f"Refused: {escaped(str(error))}"], False
         lines, is_good = [*lines, "", *described], is_good and opens
@@ -46,11 +45,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0 if all would be opened, 1 if something is refused, 2 if it is no such file
     """
-    know_ablations()
     parser = Parser("inspect", "Show what a saved file holds, what of it is code, and whether it would be opened.")
     parser.add_argument("path", type=Path, help=f"a {_KINDS}, or a run folder")
     parser.add_argument(
-        "--algo", type=one_of("algorithm", ALGORITHMS), help="of the zip of a model (default: the one of its policy)"
+        "--algo",
+        type=one_of("algorithm", KNOWN_ALGORITHMS),
+        help="of the zip of a model (default: the one of its policy)",
     )
     args = parser.parse_args(argv)
     path = args.path
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if path.is_dir() and args.algo is not None:
         parser.fail(ValueError("--algo is for the zip of a model: the folder of a run names its own"))
     try:
-        lines, is_good = inspect_run(path) if path.is_dir() else inspect(path, ALGORITHMS.get(args.algo))
+        lines, is_good = inspect_run(path) if path.is_dir() else inspect(path, KNOWN_ALGORITHMS.get(args.algo))
     except ValueError as error:
         expected = "" if path.is_dir() else f"; it must be a {_KINDS}"
         parser.fail(ValueError(f"{escaped(str(error))}{expected}"))

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Names, Parser, one_of
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made
@@ -87,7 +86,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0 if all that can be run is finished, 1 if something failed, 130 if the user stopped it
     """
-    know_ablations()
     parser = make_parser()
     args = parser.parse_args(argv)
     try:

@@ -4,7 +4,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made
@@ -22,7 +21,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: 0, or 1 if there is nothing to publish, a finished run has not played its test episodes, or another run is
         in its place
     """
-    know_ablations()
     parser = Parser(
         "publish", "Copy the small files of all finished runs: evaluations, settings, versions, test returns, the log."
     )

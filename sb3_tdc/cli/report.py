@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.experiments.report import write_report
@@ -17,7 +16,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0
     """
-    know_ablations()
     parser = Parser("report", "Make one HTML page of all runs in some folders, with figures and tables next to it.")
     parser.add_argument(
         "logs", type=Path, nargs="+", help="folder of runs; of a seed that several have, the last counts"

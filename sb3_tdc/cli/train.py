@@ -5,7 +5,6 @@ import time
 from collections.abc import Sequence
 from datetime import timedelta
 
-from sb3_tdc.ablations import know_ablations
 from sb3_tdc.cli.arguments import Parser, add_all_settings, warn_about_trust
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.finite import NonFiniteError
@@ -72,7 +71,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(argv: Sequence[str] | None) -> int:
-    know_ablations()
     parser = make_parser()
     settings, given = RunSettings(**vars(parser.parse_args(argv))), parser.parse_given(argv)
     start = time.monotonic()

@@ -7,8 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from sb3_tdc.ablations import know_ablations
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli.arguments import Parser, add_settings, one_of
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.commands import command
@@ -20,6 +18,7 @@ from sb3_tdc.experiments.jobs import Job, cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs
 from sb3_tdc.experiments.trials import make_trials, read_returns, run_trials
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import folder_name
 from sb3_tdc.runs.settings import plain_arguments
 from sb3_tdc.safe_load.regular_files import read_text
@@ -103,7 +102,7 @@ def _read_stored(path: Path) -> dict[str, Any]:
         if isinstance(value, (list, dict)) and not all(isinstance(each, str) for each in value):
             raise ValueError(f"{path}: {name} must hold texts, got {value!r}")
     try:
-        one_of("algorithm", ALGORITHMS)(str(arguments["algo"]))
+        one_of("algorithm", KNOWN_ALGORITHMS)(str(arguments["algo"]))
     except argparse.ArgumentTypeError as error:
         raise ValueError(f"{path}: {error}") from error
     return arguments
@@ -139,7 +138,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: arguments, those of the process by default
     :return: 0, 1 if a trial failed, 130 if the user stopped the search
     """
-    know_ablations()
     parser = make_parser()
     args, given = parser.parse_args(argv), parser.parse_given(argv)
     try:

@@ -8,16 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.plots import add_legend, style_axes
 from sb3_tdc.common.words import count, counted
 from sb3_tdc.experiments.published_curves import PublishedCurve
 from sb3_tdc.experiments.statistics import mean_interval
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 # Okabe and Ito's colours, which the colour-blind can tell apart
 _OF_SB3 = {"TD3": "#D55E00", "SAC": "#009E73", "DDPG": "#CC79A7"}
 COLORS: dict[str, str] = _OF_SB3 | {
-    name.upper(): color for name, algorithm in ALGORITHMS.items() if (color := vars(algorithm).get("color")) is not None
+    name.upper(): color
+    for name, algorithm in KNOWN_ALGORITHMS.items()
+    if (color := vars(algorithm).get("color")) is not None
 }
 OTHER_COLORS = ("#56B4E9", "#000000", "#8C564B", "#9467BD", "#BCBD22", "#17BECF")  # grey is for published ones
 

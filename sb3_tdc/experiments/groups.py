@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.experiments.results import Run, canonical, default_settings, flatten, same_settings
 from sb3_tdc.experiments.statistics import final_return
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 # The length of a run and how it is looked at: no hyperparameters of the algorithm
 _NOT_HYPERPARAMETERS = {"n_timesteps", "eval_freq", "eval_episodes", "mujoco"}
@@ -138,7 +138,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
             seeds[run.seed] = run
     members = [tuple(seeds[seed] for seed in sorted(seeds)) for seeds in found.values()]
     groups = [Group(_label(group[0], [other[0] for other in members]), group) for group in members]
-    place = {algo: i for i, algo in enumerate(ALGORITHMS)}
+    place = {algo: i for i, algo in enumerate(KNOWN_ALGORITHMS)}
     return sorted(groups, key=lambda g: (g.conditions, place.get(g.algo, len(place)), g.label))
 
 

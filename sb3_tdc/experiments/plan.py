@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.checks import suggest
 from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.experiments.results import default_settings, find_runs, same_settings
 from sb3_tdc.experiments.suites import Cell
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.settings import RunSettings
 from sb3_tdc.runs.setup import make_run
 from sb3_tdc.runs.training import train
@@ -92,7 +92,7 @@ def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
 
 def _why_missing(cell: Cell) -> str:
     """Return why a cell cannot be run here, or ""."""
-    if cell.algo not in ALGORITHMS:
+    if cell.algo not in KNOWN_ALGORITHMS:
         return f"this version of the package has no {cell.algo.upper()}"
     if simulator_of(cell.env_id).make_vec is not None:
         return "it has no evaluations, and a simulation of its own on a GPU: train it by sb3-tdc train"

@@ -12,12 +12,12 @@ from importlib.metadata import PackageNotFoundError, version
 import gymnasium as gym
 import pandas as pd
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.versions import commit_of_the_code, processor_name
 from sb3_tdc.experiments.groups import Group, describe, differences
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import PAPER, Cell
 from sb3_tdc.experiments.tables import number
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 _PACKAGES = ("sb3-tdc", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy", "scipy")
 _TITLES = {
@@ -71,7 +71,7 @@ def _column(cell: Cell) -> str:
 
 
 def _why_absent(cell: Cell) -> str:
-    if cell.algo not in ALGORITHMS:
+    if cell.algo not in KNOWN_ALGORITHMS:
         return f"This version of the package has no {cell.algo.upper()}"
     if cell.env_id not in gym.registry:
         return "Their simulator is not installed, or not imported, where this report was made"

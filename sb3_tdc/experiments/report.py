@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_tdc.advb.algorithms import Advised
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.words import count, listed
 from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import Group, group_runs
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.sections import LIST, Report
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 
 def warnings(groups: Sequence[Group]) -> list[str]:
@@ -44,7 +44,7 @@ def warnings(groups: Sequence[Group]) -> list[str]:
             f"Seeds of {count(len(mixed), 'group')} were trained by several commits of sb3_tdc ({listed(mixed)}): "
             "see the commits below, and what changed between them."
         )
-    advised = [g for g in groups if g.finished and issubclass(ALGORITHMS.get(g.algo, object), Advised)]
+    advised = [g for g in groups if g.finished and issubclass(KNOWN_ALGORITHMS.get(g.algo, object), Advised)]
     said += [f"{g.label} on {g.conditions}: {_describe_board(g)}" for g in advised]
     return said
 

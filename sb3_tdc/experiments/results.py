@@ -14,11 +14,11 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.envs.simulator import GYMNASIUM
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
 from sb3_tdc.safe_load import read_system_info
@@ -248,7 +248,7 @@ def _may_use_mujoco(env_id: str) -> bool:
 @cache
 def default_settings(algo: str) -> dict[str, Any]:
     """Return the defaults of the algorithm's constructor and of ``sb3-tdc train``."""
-    parameters = constructor_parameters(ALGORITHMS[algo]).values() if algo in ALGORITHMS else ()
+    parameters = constructor_parameters(KNOWN_ALGORITHMS[algo]).values() if algo in KNOWN_ALGORITHMS else ()
     return {**{p.name: p.default for p in parameters if p.default is not p.empty}, **_SETTINGS}
 
 

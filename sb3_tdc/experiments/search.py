@@ -5,12 +5,12 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job, count_cores
 from sb3_tdc.experiments.search_space import LAMBDAS, make_candidates, parse_space
 from sb3_tdc.hyperparams import constructor_hints, hyperparams_file, parse, read_entry
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.models import make_model
 
 
@@ -30,7 +30,7 @@ def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
     require_env(args.env)
     space = parse_space(args.search)
     if not space:
-        if "lam" not in constructor_hints(ALGORITHMS[args.algo]):
+        if "lam" not in constructor_hints(KNOWN_ALGORITHMS[args.algo]):
             raise ValueError(f"{args.algo} has no λ: say what to --search")
         space = {"lam": LAMBDAS}
     args.searched = list(space)
@@ -63,7 +63,7 @@ def check(algo: str, env_id: str, settings: dict[str, Any]) -> None:
     """
     entry, name = read_entry(hyperparams_file(algo), env_id)
     where = f"{hyperparams_file(algo)}, {name}"
-    hyperparams = parse(entry, ALGORITHMS[algo], where, settings, "--search and -params")
+    hyperparams = parse(entry, KNOWN_ALGORITHMS[algo], where, settings, "--search and -params")
     try:
         with closing(make_envs(env_id, hyperparams, seed=1, n_envs=hyperparams.n_envs)) as env:
             small = replace(hyperparams, model={**hyperparams.model, "buffer_size": 1_000})

@@ -15,13 +15,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.checks import check_observation_space
 from sb3_tdc.common.files import write_atomically
 from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
 from sb3_tdc.common.words import count
 from sb3_tdc.envs.vector import GymnasiumVecEnv
 from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.callbacks.finite_guard import check_before_saving
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, read_data
@@ -36,7 +36,7 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
     """
     Build a model as its hyperparameters say.
 
-    :param algo: a key of ``ALGORITHMS``
+    :param algo: a key of ``KNOWN_ALGORITHMS``
     :param kwargs: further arguments of the algorithm's constructor
     :raises ValueError: if the policy, the networks or the replay buffer do not fit the environment, or memory is short
     """
@@ -48,7 +48,7 @@ def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) 
         )
     _check_hindsight(hyperparams, env)
     with _enough_memory(hyperparams):
-        return ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
+        return KNOWN_ALGORITHMS[algo](env=env, **hyperparams.model, **_action_noise(hyperparams, env), **kwargs)
 
 
 def _check_hindsight(hyperparams: Hyperparams, env: VecEnv) -> None:
@@ -109,16 +109,16 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
     """
     Load a saved model.
 
-    :param algo: a key of ``ALGORITHMS``
+    :param algo: a key of ``KNOWN_ALGORITHMS``
     :param trust: whether the file may run code, as SB3's ``load`` lets it
     :param kwargs: those of the algorithm's ``load``
     :raises ValueError: if a file is not a saved model, is of another algorithm, or is refused
     """
     check_saved_by(path, algo)
     if trust:
-        return ALGORITHMS[algo].load(path, env=env, **kwargs)
+        return KNOWN_ALGORITHMS[algo].load(path, env=env, **kwargs)
     try:
-        return load_safely(path, env, algorithm=ALGORITHMS[algo], **kwargs)
+        return load_safely(path, env, algorithm=KNOWN_ALGORITHMS[algo], **kwargs)
     except UnsafeFileError as error:
         raise UnsafeFileError(on_the_command_line(str(error))) from error
 
@@ -128,7 +128,7 @@ def needs_trust(path: Path, algo: str) -> bool:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            read_model_fields(path, ALGORITHMS[algo])
+            read_model_fields(path, KNOWN_ALGORITHMS[algo])
     except UnsafeFileError:
         with suppress(UnsafeFileError):  # damaged: --trust would not help
             return names_code(path)
@@ -143,8 +143,8 @@ def check_saved_by(path: Path, algo: str) -> None:
     """
     policy_class = read_data(path).get("policy_class")
     module = policy_class.get("__module__") if isinstance(policy_class, dict) else None
-    modules = {a: {p.__module__ for p in ALGORITHMS[a].policy_aliases.values()} for a in ALGORITHMS}
-    others = [a for a in ALGORITHMS if module in modules[a]]
+    modules = {a: {p.__module__ for p in KNOWN_ALGORITHMS[a].policy_aliases.values()} for a in KNOWN_ALGORITHMS}
+    others = [a for a in KNOWN_ALGORITHMS if module in modules[a]]
     if others and algo not in others:
         named = list(dict.fromkeys(a.partition("-")[0] for a in others))  # variants are called after their algorithm
         raise ValueError(f"{path} was saved by {' or '.join(named)}, not by {algo}: --algo {named[0]}")

@@ -15,6 +15,7 @@ from typing import Any
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.checks import check_device
 from sb3_tdc.resume import DEFAULT_FREQ
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 # NumPy takes no seed above 2**32, and environments are seeded with this one and a little more
 MAX_SEED = 2**31 - 1
@@ -75,7 +76,10 @@ class RunSettings:
     """Every setting with its flag, its default and what depends on it."""
 
     algo: str = setting(
-        default="tdc", help="algorithm: " + ", ".join(ALGORITHMS), group=Group.RUN, known=("algorithm", ALGORITHMS)
+        default="tdc",
+        help="algorithm: " + ", ".join(ALGORITHMS),
+        group=Group.RUN,
+        known=("algorithm", KNOWN_ALGORITHMS),
     )
     env: str = setting(default="HalfCheetah-v4", group=Group.RUN, help="environment id")
     n_timesteps: int = setting(

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.commands import command
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
 from sb3_tdc.resume import stored_steps
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, default_of, flags_of, plain_arguments
 from sb3_tdc.runs.training import TrainingRun
@@ -59,7 +59,7 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
     n_timesteps = {"n_timesteps": settings.n_timesteps} if settings.n_timesteps > 0 else {}
     overrides = {**settings.hyperparams, **n_timesteps}
     where = f"{path}, {name}"
-    hyperparams = parse(entry, ALGORITHMS[settings.algo], where, overrides, _COMMAND_LINE)
+    hyperparams = parse(entry, KNOWN_ALGORITHMS[settings.algo], where, overrides, _COMMAND_LINE)
     if settings.verbose > 0:
         nearest = "" if name == "default" else "; this is the nearest version"
         other = "" if name in (settings.preset, settings.env) else f" (it has no entry for {settings.env}{nearest})"
@@ -130,7 +130,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
         )
     _prepare(settings)
     where = str(folder.path / folder.env_name / "config.yml")
-    hyperparams = parse(config, ALGORITHMS[settings.algo], where, differing, _COMMAND_LINE)
+    hyperparams = parse(config, KNOWN_ALGORITHMS[settings.algo], where, differing, _COMMAND_LINE)
     former_length = folder.n_timesteps if "n_timesteps" in differing else None
     set_random_seed(settings.seed)
     others = tuple(name for name in differing if name != "n_timesteps")
@@ -195,7 +195,7 @@ def _stored_settings(folder: RunFolder, where: str) -> dict[str, Any]:
     :raises ValueError: if one is of another type
     """
     stored = folder.args
-    check_arguments(stored, ALGORITHMS, where)
+    check_arguments(stored, KNOWN_ALGORITHMS, where)
     types = {declared.name: declared.type for declared in fields(RunSettings)}
     # RL Zoo has further arguments, and null for what is not given
     known = {name: value for name, value in stored.items() if name in types and value is not None}

@@ -8,12 +8,12 @@ from typing import Any
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.registry import has_vector_env, import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, parse
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import load_model, needs_trust
 from sb3_tdc.safe_load.run_files import check_arguments, check_imports, refused_imports
@@ -122,7 +122,7 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
     :raises ValueError: if a file is missing, damaged, or names code that is not allowed
     """
     trained, config = run.args, run.config
-    check_arguments(trained, ALGORITHMS, str(run.path / run.env_name / "args.yml"))
+    check_arguments(trained, KNOWN_ALGORITHMS, str(run.path / run.env_name / "args.yml"))
     if not trust:
         check_imports(trained, config, consented, str(run.path))
     env_id, packages = split_env_id(trained["env"], [*trained["gym_packages"], *consented])
@@ -131,7 +131,7 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
     of_the_environment = {key: value for key, value in config.items() if key in _OF_THE_ENVIRONMENT}
     gamma = {"gamma": config["gamma"]} if "gamma" in config else {}
     where = str(run.path / run.env_name / "config.yml")
-    hyperparams = parse({"n_timesteps": 1, **gamma, **of_the_environment}, ALGORITHMS[trained["algo"]], where)
+    hyperparams = parse({"n_timesteps": 1, **gamma, **of_the_environment}, KNOWN_ALGORITHMS[trained["algo"]], where)
     return TrainedModel(
         path,
         trained["algo"],
@@ -156,4 +156,4 @@ def flags_to_open(runs: Iterable[RunFolder]) -> list[str]:
 def open_zip(path: Path, algo: str, env_id: str, trust: bool = False) -> TrainedModel:
     """Return a model that lies outside a run, with the algorithm and the registered environment that the user names."""
     require_env(env_id)
-    return TrainedModel(path, algo, env_id, parse({"n_timesteps": 1}, ALGORITHMS[algo], str(path)), trust=trust)
+    return TrainedModel(path, algo, env_id, parse({"n_timesteps": 1}, KNOWN_ALGORITHMS[algo], str(path)), trust=trust)

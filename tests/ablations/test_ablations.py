@@ -5,9 +5,8 @@ import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_tdc.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC, know_ablations
+from sb3_tdc.ablations import ABLATIONS, PessimisticTDC, ScaledKappaTDC, ShiftedTDC
 from sb3_tdc.ablations.calibration import CalibratedTDC
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.hyperparams import hyperparams_file
 from sb3_tdc.runs.models import load_model
@@ -90,23 +89,17 @@ def test_kappa_follows_the_errors_that_it_bounds():
 
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_saved_and_opened(name, tmp_path):
-    before = dict(ALGORITHMS)
-    know_ablations()
-    try:
-        model = make(ABLATIONS[name], lam=0.0).learn(60)
-        if isinstance(model, CalibratedTDC):
-            model._calibrate(np.array([-1.0 if name == "tdc-pessimism" else 1.0]))
-            assert abs(model.calibrated) == pytest.approx(0.1)
-        model.save(tmp_path / "model.zip")
-        opened = load_model(tmp_path / "model.zip", name, None, False, device="cpu")
-        assert type(opened) is ABLATIONS[name]
-        assert opened.kappa == model.kappa
-        for attribute in ("calibrated", "error_scale"):
-            assert getattr(opened, attribute, None) == getattr(model, attribute, None)
-        assert hyperparams_file(name) == hyperparams_file("tdc")
-    finally:
-        ALGORITHMS.clear()
-        ALGORITHMS.update(before)
+    model = make(ABLATIONS[name], lam=0.0).learn(60)
+    if isinstance(model, CalibratedTDC):
+        model._calibrate(np.array([-1.0 if name == "tdc-pessimism" else 1.0]))
+        assert abs(model.calibrated) == pytest.approx(0.1)
+    model.save(tmp_path / "model.zip")
+    opened = load_model(tmp_path / "model.zip", name, None, False, device="cpu")
+    assert type(opened) is ABLATIONS[name]
+    assert opened.kappa == model.kappa
+    for attribute in ("calibrated", "error_scale"):
+        assert getattr(opened, attribute, None) == getattr(model, attribute, None)
+    assert hyperparams_file(name) == hyperparams_file("tdc")
 
 
 def test_the_commands_train_resume_and_play_them(tmp_path, capsys):

@@ -9,12 +9,12 @@ import pytest
 import yaml
 from matplotlib import figure
 
-from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.cli import evaluate, train
 from sb3_tdc.cli import report as report_command
 from sb3_tdc.experiments import curves, figures, final_episodes, provenance, report, sections, tables
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import Run, find_runs
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.trained import TrainedModel
 from tests.helpers.run_folders import make_run
 
@@ -195,8 +195,8 @@ def test_bins_scale_with_the_run_but_hold_an_evaluation(tmp_path):
 
 
 def test_what_is_missing_is_said(tmp_path, monkeypatch):
-    others = {name: algorithm for name, algorithm in ALGORITHMS.items() if name != "meow"}
-    monkeypatch.setattr(provenance, "ALGORITHMS", others)
+    others = {name: algorithm for name, algorithm in KNOWN_ALGORITHMS.items() if name != "meow"}
+    monkeypatch.setattr(provenance, "KNOWN_ALGORITHMS", others)
     make_run(tmp_path, seed=1)
     make_run(tmp_path, seed=2, steps=400)
     make_run(tmp_path, seed=4, kappa=3.0)  # not of the paper
