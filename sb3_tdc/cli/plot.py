@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from sb3_tdc.cli.arguments import Parser
-from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.files import check_writable
 from sb3_tdc.common.plots import add_legend, import_figure, style_axes
 from sb3_tdc.common.words import counted
+from sb3_tdc.runs.evaluations import read_evaluations
 from sb3_tdc.runs.folder import RunFolder
 
 _LABELS_IN_A_COLUMN = 16
@@ -42,11 +42,10 @@ def load_curve(run: RunFolder, until: int | None = None) -> Evaluated:
     :param until: leave out those after this step
     :raises ValueError: if the run has no evaluations, or they cannot be read
     """
-    path = run.path / "evaluations.npz"
-    if not path.is_file():
+    path, args, evaluations = run.evaluations, run.args, read_evaluations(run)
+    if evaluations is None:
         raise ValueError(f"{path} does not exist: the run has not been evaluated yet")
-    args = run.args
-    timesteps, returns = read_arrays(path, "timesteps", "results")
+    timesteps, returns = evaluations.timesteps, evaluations.returns
     shown = timesteps <= (np.inf if until is None else until)
     if not shown.any():
         raise ValueError(f"{path} has no evaluation until step {until:,}, the first is at step {timesteps[0]:,}")
@@ -71,7 +70,7 @@ def load_curves(runs: Sequence[Path], until: int | None = None) -> list[Evaluate
 
 def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
     """
-    One line a run, the mean over the episodes of each evaluation; the episodes are the dots.
+    Draw one line for each run, the mean over the episodes of each evaluation; the episodes are the dots.
 
     :param axes: of matplotlib
     :param curves: of one environment

@@ -14,11 +14,11 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 
-from sb3_tdc.common.arrays import read_arrays
 from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.envs.simulator import GYMNASIUM
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
+from sb3_tdc.runs.evaluations import Evaluations, read_evaluations
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
 from sb3_tdc.safe_load import read_system_info
@@ -27,19 +27,6 @@ from sb3_tdc.safe_load import read_system_info
 _LATE = 1 / 3
 # Settings that make another experiment of the same hyperparameters, and their defaults
 _SETTINGS = defaults(Role.EXPERIMENT)
-
-
-@dataclass(frozen=True)
-class Evaluations:
-    """
-    The evaluations of one run.
-
-    :param timesteps: (evaluations,)
-    :param returns: (evaluations, episodes), of the mean action
-    """
-
-    timesteps: np.ndarray
-    returns: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -125,10 +112,7 @@ class Run:
     @cached_property
     def evaluations(self) -> Evaluations | None:
         """None if it has not been evaluated."""
-        path = self.folder.path / "evaluations.npz"
-        if not path.is_file():
-            return None
-        return Evaluations(*read_arrays(path, "timesteps", "results"))
+        return read_evaluations(self.folder)
 
     @cached_property
     def log(self) -> pd.DataFrame:
@@ -253,7 +237,7 @@ def default_settings(algo: str) -> dict[str, Any]:
 
 
 def canonical(value: Any) -> str:
-    """A text that is the same for the same settings: 1 and 1.0 are."""
+    """Return a canonical text of settings (1 equals 1.0)."""
 
     def same(item: Any) -> Any:
         if isinstance(item, dict):

@@ -110,6 +110,10 @@ class RunFolder:
         return self.path / "best_model.zip"
 
     @property
+    def evaluations(self) -> Path:
+        return self.path / "evaluations.npz"
+
+    @property
     def trained_agent(self) -> Path:
         """A copy of the model that the run started from: its networks, if the original has moved when it is resumed."""
         return self.path / self.env_name / "trained_agent.zip"
@@ -148,7 +152,7 @@ class RunFolder:
         """Return whether something would be overwritten if the run began at step 0 again."""
         logs = {self.path / "progress.csv": 1, **dict.fromkeys(self.path.glob("*monitor.csv"), 2)}  # lines of a header
         has_rows = any(log.is_file() and log.read_bytes().count(b"\n") > header for log, header in logs.items())
-        return has_rows or any(self.path.glob("*.zip")) or (self.path / "evaluations.npz").is_file()
+        return has_rows or any(self.path.glob("*.zip")) or self.evaluations.is_file()
 
     @property
     def n_timesteps(self) -> int:
