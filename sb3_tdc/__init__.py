@@ -1,4 +1,4 @@
-"""TDC-λ and the paper's rivals for Stable-Baselines3: ``from sb3_tdc import TDC``."""
+"""TDC-λ and the paper's baselines for Stable-Baselines3: ``from sb3_tdc import TDC``."""
 
 import importlib
 from importlib.metadata import version

@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_trust(parser)
     args = parser.parse_args(argv)
     if args.episodes < 1:
-        parser.fail(ValueError(f"--episodes must be at least 1, got {args.episodes}"))
+        parser.error(f"--episodes must be at least 1, got {args.episodes}")
     try:
         runs, unreadable = find_runs(args.logs)
     except ValueError as error:

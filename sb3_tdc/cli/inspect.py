@@ -55,13 +55,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     path = args.path
     if not path.exists():
-        parser.fail(ValueError(f"{escaped(str(path))} does not exist"))
+        parser.error(f"{escaped(str(path))} does not exist")
     if path.is_dir() and args.algo is not None:
-        parser.fail(ValueError("--algo is for the zip of a model: the folder of a run names its own"))
+        parser.error("--algo is for the zip of a model: the folder of a run names its own")
     try:
         lines, is_good = inspect_run(path) if path.is_dir() else inspect(path, KNOWN_ALGORITHMS.get(args.algo))
     except ValueError as error:
         expected = "" if path.is_dir() else f"; it must be a {_KINDS}"
-        parser.fail(ValueError(f"{escaped(str(error))}{expected}"))
+        parser.error(f"{escaped(str(error))}{expected}")
     print("\n".join(lines))
     return 0 if is_good else 1

@@ -12,8 +12,9 @@ from sb3_tdc.common.files import check_can_be_made
 from sb3_tdc.common.output import harmless_output
 from sb3_tdc.experiments.jobs import Job, cluster, count_cores
 from sb3_tdc.experiments.matrix import run_jobs
-from sb3_tdc.experiments.plan import Plan, dry_run, make_plan, read_rates, select
+from sb3_tdc.experiments.plan import Plan, dry_run, make_plan, select
 from sb3_tdc.experiments.publish import RESULTS
+from sb3_tdc.experiments.rates import read_rates
 from sb3_tdc.experiments.suites import PAPER, SUITES
 
 

@@ -15,7 +15,7 @@ from sb3_tdc.experiments.groups import Group, as_shipped, by_conditions, is_as_s
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import MUJOCO, PYBULLET
 
-RIVALS = ("td3", "sac", "meow", "ddpg")
+BASELINES = ("td3", "sac", "meow", "ddpg")
 # The χ² interval is of normal values. Where some seeds leave a plateau and others do not, three seeds of one and the
 # same law would be told apart in a fifth of all cases, and ten in a hundredth
 MIN_SEEDS_OF_SPREAD = 10
@@ -188,16 +188,16 @@ def examine(groups: Sequence[Group]) -> list[Claim]:
 
 
 def _returns(groups: Sequence[Group]) -> Iterator[Claim]:
-    for plain, rival in _rivals(groups):
-        yield _claim("1. λ-LCB has the highest return, or a comparable one", _RETURN, plain, rival, judge_at_least)
+    for plain, baseline in _baselines(groups):
+        yield _claim("1. λ-LCB has the highest return, or a comparable one", _RETURN, plain, baseline, judge_at_least)
 
 
 def _variances(groups: Sequence[Group]) -> Iterator[Claim]:
-    for plain, rival in _rivals(groups):
-        yield _claim("2. λ-LCB varies less", _SEEDS, plain, rival, judge_spread)
+    for plain, baseline in _baselines(groups):
+        yield _claim("2. λ-LCB varies less", _SEEDS, plain, baseline, judge_spread)
         # More episodes an evaluation, or more evaluations, and their scatter is another one
-        if all(plain.setting(key) == rival.setting(key) for key in ("eval_freq", "eval_episodes")):
-            yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, rival, judge_smaller)
+        if all(plain.setting(key) == baseline.setting(key) for key in ("eval_freq", "eval_episodes")):
+            yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, baseline, judge_smaller)
 
 
 def _lambdas(groups: Sequence[Group]) -> Iterator[Claim]:
@@ -220,12 +220,12 @@ def _td_errors(groups: Sequence[Group]) -> Iterator[Claim]:
             yield _claim("5. λ = 1 lowers the variance of TD errors", _TD_ERRORS, of_lam[1], of_lam[0], judge_smaller)
 
 
-def _rivals(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
-    """Pairs of TDC and a rival on a task of the paper, both as ``hyperparams/`` has them."""
+def _baselines(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
+    """Pairs of TDC and a baseline on a task of the paper, both as ``hyperparams/`` has them."""
     shipped = [group for group in as_shipped(groups) if group.env_id in (*MUJOCO, *PYBULLET)]
     for plain in (group for group in shipped if group.algo == "tdc"):
-        for rival in (group for group in shipped if group.algo in RIVALS):
-            yield plain, rival
+        for baseline in (group for group in shipped if group.algo in BASELINES):
+            yield plain, baseline
 
 
 def _ablations(groups: Sequence[Group], key: str, *env_ids: str) -> list[list[Group]]:

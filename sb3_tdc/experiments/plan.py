@@ -1,29 +1,19 @@
 """The runs of a suite: what there is to do, and how long it takes."""
 
 import heapq
-import tempfile
-import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-
-import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc.common.checks import suggest
 from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job
-from sb3_tdc.experiments.results import default_settings, find_runs, same_settings
+from sb3_tdc.experiments.rates import MEASURED_STEPS, measure_rate
+from sb3_tdc.experiments.results import default_settings, same_settings
 from sb3_tdc.experiments.suites import Cell
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
-from sb3_tdc.runs.settings import RunSettings
-from sb3_tdc.runs.setup import make_run
-from sb3_tdc.runs.training import train
-
-# Of a measurement of speed: the first updates compile, allocate, warm up
-_FIRST, _LAST = 100, 300
 
 
 @dataclass(frozen=True)
@@ -111,65 +101,6 @@ def estimate_seconds(seconds: Iterable[float], n_jobs: int) -> float:
     return max(free_at)
 
 
-def read_rates(logs: Path) -> dict[tuple[str, str], float]:
-    """
-    Environment steps per second, evaluations included, of finished runs.
-
-    :return: by algorithm and environment, the median; including the time before a stopped run was resumed
-    """
-    found: dict[tuple[str, str], list[float]] = {}
-    try:
-        runs, _ = find_runs(logs)
-    except ValueError:
-        return {}
-    for finished in (one for one in runs if one.is_finished):
-        progress = finished.progress("time/total_timesteps", "time/time_elapsed")
-        if len(progress) and progress[-1, 1] > 0:
-            found.setdefault((finished.algo, finished.env_id), []).append(progress[-1, 0] / progress[-1, 1])
-    return {key: float(np.median(rates)) for key, rates in found.items()}
-
-
-class _Clock(BaseCallback):
-    """Reads step and time from a step on."""
-
-    def _on_training_start(self) -> None:
-        self.readings: list[tuple[int, float]] = []
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= _FIRST:
-            self.readings.append((self.num_timesteps, time.perf_counter()))
-        return True
-
-
-def measure_rate(job: Job) -> float:
-    """Return environment steps per second, with updates, without evaluations; on one thread, over a few hundred."""
-    clock = _Clock()
-    n_timesteps = max(_LAST, 10 * job.config.get("n_envs", 1))
-    config = replace(job, n_timesteps=n_timesteps).config
-    config["learning_starts"] = min(config.get("learning_starts", _FIRST), _FIRST)  # also where the job sets it
-    with tempfile.TemporaryDirectory() as folder:
-        settings = RunSettings(
-            algo=job.algo,
-            env=job.env_id,
-            n_timesteps=n_timesteps,
-            seed=job.seed,
-            log_folder=folder,
-            hyperparams=config,
-            gym_packages=list(job.packages),
-            eval_freq=-1,
-            resume_freq=-1,
-            num_threads=1,
-            device="cpu",
-            verbose=0,
-        )
-        run = make_run(settings)
-        run.hyperparams.callbacks.append(lambda: clock)
-        if train(run).interrupted:
-            raise KeyboardInterrupt
-    (first, start), (last, end) = clock.readings[0], clock.readings[-1]
-    return (last - first) / (end - start)
-
-
 def dry_run(plan: Plan, rates: Mapping[tuple[str, str], float], n_jobs: int) -> None:
     """Print what would be done with every job, and how long it would take."""
     rates, seconds = dict(rates), []
@@ -180,7 +111,7 @@ def dry_run(plan: Plan, rates: Mapping[tuple[str, str], float], n_jobs: int) -> 
         if verb != "skip":
             if key not in rates:
                 rates[key] = measure_rate(job)
-                print(f"       {rates[key]:.0f} steps/s, of {_LAST - _FIRST} steps, without evaluations")
+                print(f"       {rates[key]:.0f} steps/s, of {MEASURED_STEPS} steps, without evaluations")
             seconds.append((job.n_timesteps - done) / rates[key])
     total = timedelta(seconds=round(estimate_seconds(seconds, n_jobs)))
     print(f"{len(seconds)} of {len(plan.jobs)} to run, {n_jobs} at once: about {total} (hours:minutes:seconds)")

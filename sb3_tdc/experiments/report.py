@@ -17,8 +17,8 @@ from sb3_tdc.experiments.sections import LIST, Report
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 
-def warnings(groups: Sequence[Group]) -> list[str]:
-    """What a reader must know before looking at a figure."""
+def make_warnings(groups: Sequence[Group]) -> list[str]:
+    """Return what a reader must know before looking at a figure."""
     shares = sorted({g.share for g in groups if g.finished and g.shipped_steps})
     fewest = min((len(g.finished) for g in groups if g.finished), default=0)
     said = []
@@ -92,7 +92,7 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     )
     page = environment.get_template("report.html").render(
         sections=sections,
-        warnings=warnings(groups),
+        warnings=make_warnings(groups),
         counts={
             "finished runs": sum(run.is_finished for run in runs),
             "unfinished": sum(not run.is_finished for run in runs),

@@ -20,6 +20,7 @@ from sb3_tdc.common.files import lock
 from sb3_tdc.experiments import jobs as job_module
 from sb3_tdc.experiments import matrix as running
 from sb3_tdc.experiments import plan as planning
+from sb3_tdc.experiments import rates
 from sb3_tdc.experiments.jobs import Job, TrainedElsewhereError, eval_freq, stop
 from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.suites import SUITES, Cell
@@ -110,8 +111,8 @@ def test_rates_are_those_of_finished_runs(tmp_path):
     for seed, seconds, steps in ((1, 10, 1000), (2, 20, 1000), (3, 40, 1000), (4, 1, None)):
         folder = make_run(tmp_path, seed=seed, steps=steps)
         (folder.path / "progress.csv").write_text(f"time/total_timesteps,time/time_elapsed\n500,1\n1000,{seconds}\n")
-    assert planning.read_rates(tmp_path) == {("tdc", "Hopper-v4"): 50}  # the median of 100, 50 and 25
-    assert planning.read_rates(tmp_path / "nothing") == {}
+    assert rates.read_rates(tmp_path) == {("tdc", "Hopper-v4"): 50}  # the median of 100, 50 and 25
+    assert rates.read_rates(tmp_path / "nothing") == {}
 
 
 def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
@@ -263,8 +264,8 @@ def test_a_rate_is_measured_with_updates_whatever_the_warm_up(warm_up, tmp_path,
         outcomes.append(train(run))
         return outcomes[-1]
 
-    monkeypatch.setattr(planning, "train", train_and_keep)
-    assert planning.measure_rate(Job("tdc", "Pendulum-v1", 1, 300_000, tmp_path, {**SMALL_TDC, **warm_up})) > 0
+    monkeypatch.setattr(rates, "train", train_and_keep)
+    assert rates.measure_rate(Job("tdc", "Pendulum-v1", 1, 300_000, tmp_path, {**SMALL_TDC, **warm_up})) > 0
     (outcome,) = outcomes
     assert outcome.model.num_timesteps == 300
     assert outcome.model._n_updates >= 200

@@ -324,7 +324,7 @@ def test_runs_without_evaluations_have_no_figure(tmp_path):
     (run.path / "evaluations.npz").unlink()
     groups = read_groups(tmp_path / "logs")
     assert sections.Report(groups, tmp_path).learning_curves().pictures == []
-    assert report.warnings(groups)[0].startswith("No run is finished and evaluated")
+    assert report.make_warnings(groups)[0].startswith("No run is finished and evaluated")
 
 
 def test_tasks_of_one_length_are_one_row(tmp_path):
@@ -370,7 +370,7 @@ def test_seeds_of_several_commits_are_said(tmp_path):
 def test_the_steps_of_test_episodes_of_a_board_are_said(tmp_path):
     make_run(tmp_path, algo="advb_td3", log={"board/test_steps": [100.0, 4321.0]})
     make_run(tmp_path, algo="td3")
-    said = [text for text in report.warnings(read_groups(tmp_path)) if "board" in text]
+    said = [text for text in report.make_warnings(read_groups(tmp_path)) if "board" in text]
     assert len(said) == 1
     assert "ADVB_TD3 on Hopper-v4" in said[0]
     assert "took up to 4,321 further environment steps a run" in said[0]
