@@ -30,6 +30,7 @@ def make_parser() -> Parser:
     add("--only", nargs="+", action=Names, default=[], metavar="NAME", help="algorithms and environments to train")
     add("--logs", type=Path, default=Path("logs"), help="folder of all runs")
     add("--results", type=Path, default=RESULTS, help="folder of published results: runs that are there are skipped")
+    add("--retrain", action="store_true", help="train runs that are in the folder of published results, too")
     add("--jobs", type=int, metavar="N", help="runs at once (default: one for each core)")
     add(
         "--address",
@@ -91,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         whole = _plan(args)
-        plan = _without_published(whole, args)
+        plan = whole if args.retrain else _without_published(whole, args)
         to_run = [job for job in plan.jobs if not job.is_finished]
         _describe(args, plan)
         if args.dry_run:

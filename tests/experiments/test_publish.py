@@ -76,6 +76,8 @@ def test_the_matrix_skips_what_is_published(logs, tmp_path, monkeypatch, capsys)
     assert f"1 of 2 runs are in {tmp_path / 'results'}" in out
     assert "1 of 1 to run" in out
     assert "seed 4" in out
+    assert matrix.main([*command, "--dry-run", "--retrain"]) == 0
+    assert "2 of 2 to run" in capsys.readouterr().out
     monkeypatch.setattr(matrix, "cluster", lambda *args: nullcontext())
     monkeypatch.setattr(matrix, "run_jobs", lambda *args: SimpleNamespace(failed=[], stopped=False))
     assert matrix.main(command) == 0
