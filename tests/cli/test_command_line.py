@@ -25,7 +25,8 @@ from sb3_tdc.common.threads import set_threads
 from sb3_tdc.runs.callbacks.stopping import StopOnSignal
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization
-from tests.helpers.command_line import ROOT, SMALL, SMALL_ANY, run_enjoy, run_train
+from tests.helpers.command_line import SMALL, SMALL_ANY, run_enjoy, run_train
+from tests.helpers.paths import ROOT
 
 
 def tags(folder):

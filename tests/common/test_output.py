@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +14,8 @@ import pytest
 import sb3_tdc
 from sb3_tdc import TDC
 from sb3_tdc.common.output import harmless_output, warnings_as_sentences
+from tests.helpers.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 SETTINGS = "--eval-freq 100 --eval-episodes 1 --seed 1 -params learning_starts:50 buffer_size:1000"
 OPTIONS = ["--env", "Pendulum-v1", *SETTINGS.split()]
 

@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs import rendering
-from tests.helpers.command_line import ROOT
+from tests.helpers.paths import ROOT
 
 
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4"])

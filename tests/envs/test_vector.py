@@ -17,6 +17,7 @@ from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs.vector import GymnasiumVecEnv, split_infos
 from sb3_tdc.hyperparams import parse
 from sb3_tdc.runs.models import make_model
+from tests.helpers.command_line import SMALL
 
 MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED]
 
@@ -261,7 +262,7 @@ def test_a_run_in_a_vector_environment_is_played_in_one(tmp_path, capsys):
     """There is no other."""
     gym.register("Together-v0", vector_entry_point="tests.envs.test_vector:Together")
     options = ["--eval-freq", "150", "--eval-episodes", "1", "--device", "cpu", "-f", str(tmp_path), "-n", "200"]
-    argv = ["--env", "Together-v0", *options, "-params", *SMALL]
+    argv = ["--env", "Together-v0", *options, *SMALL_3]
     assert train.main([*argv, "--vec-env", "gymnasium"]) == 0
     assert enjoy.main([str(tmp_path / "tdc" / "Together-v0_1"), "--n-episodes", "2"]) == 0
     assert "Return: 10.00 ± 0.00" in capsys.readouterr().out  # 1 + 2 + 3 + 4
@@ -328,13 +329,13 @@ def test_infos_are_split_by_hand():
     assert split_infos(infos, 2) == [{"a": 1, "b": {"c": 3}, "_own": "x"}, {"b": {"c": 4}, "_own": "y"}]
 
 
-SMALL = ["policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16", "n_envs:3"]
+SMALL_3 = [*SMALL, "n_envs:3"]
 
 
 def train_on(folder, *args):
     argv = ["--env", "Hopper-v4", "-n", "450", "--seed", "1", "--vec-env", "gymnasium", "--eval-freq", "150"]
     argv += ["--eval-episodes", "1", "--device", "cpu", "--resume-freq", "40", "-f", folder, *args]
-    return train.main([*map(str, argv), "-params", *SMALL, "buffer_size:1000", "gradient_steps:3"])
+    return train.main([*map(str, argv), *SMALL_3, "buffer_size:1000", "gradient_steps:3"])
 
 
 def test_a_training_with_it_resumes_exactly(tmp_path, monkeypatch):

@@ -11,8 +11,8 @@ from sb3_tdc.experiments import final_episodes
 from sb3_tdc.experiments.final_episodes import read_test_returns
 from sb3_tdc.experiments.results import Run
 from tests.helpers.run_folders import make_run
+from tests.helpers.searches import SMALL
 
-SMALL = ["policy_kwargs:{net_arch: [8], n_quantiles: 4}", "learning_starts:20", "batch_size:8", "buffer_size:500"]
 HER = ["replay_buffer_class:HerReplayBuffer", "policy:MultiInputPolicy"]
 
 

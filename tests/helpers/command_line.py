@@ -1,11 +1,6 @@
 """The two commands from end to end, with small networks on Hopper."""
 
-from pathlib import Path
-
 from sb3_tdc.cli import enjoy, train
-
-ROOT = Path(__file__).parents[2]
-
 
 SMALL = ["-params", "policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
 

@@ -4,8 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-
+from tests.helpers.paths import ROOT
 
 SMALL = {"learning_starts": 20, "batch_size": 8, "buffer_size": 500}
 

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from tests.helpers.matrices import ROOT
+from tests.helpers.paths import ROOT
 
 SMALL = ["learning_starts:20", "batch_size:8", "buffer_size:500", "policy_kwargs:{net_arch: [8], n_quantiles: 4}"]
 

@@ -4,15 +4,15 @@ import pytest
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import train
+from tests.helpers import command_line
+from tests.helpers.command_line import SMALL
 from tests.tools.runs import digest, files
 
-SMALL = ["-params", "policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
 N = 400
 
 
 def run_train(folder, *args, env="Hopper-v4", n=N, small=SMALL):
-    argv = ["--env", env, "-n", n, "--seed", 1, "-f", folder, "--eval-freq", 150, "--eval-episodes", 2]
-    return train.main([str(a) for a in [*argv, "--resume-freq", 40, "--device", "cpu", *small, *args]])
+    return command_line.run_train(folder, "--resume-freq", 40, *args, env=env, n=n, small=small)
 
 
 def resume(folder, *args):

@@ -4,7 +4,6 @@ import importlib.util
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -12,9 +11,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdc.resume.environments import capture_vec_env
 from sb3_tdc.resume.kinds.table import KINDS
 from sb3_tdc.resume.walk import Capture
+from tests.helpers.paths import ROOT
 from tests.tools.runs import CASES, CROSS, OTHERS, PYBULLET, bullet
 
-ROOT = Path(__file__).parents[2]
 SLOW = [
     *CROSS,
     "readable update",

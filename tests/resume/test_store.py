@@ -11,7 +11,7 @@ import warnings
 import pytest
 
 from sb3_tdc.resume.store import BrokenStateError, LockedError, Store
-from tests.helpers.command_line import ROOT
+from tests.helpers.paths import ROOT
 
 
 @pytest.fixture

@@ -20,9 +20,8 @@ from sb3_tdc import TDC
 from sb3_tdc.resume import ResumeStates, stored_steps
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
 from sb3_tdc.runs.callbacks.stopping import StopOnSignal, StoppableEvaluation
+from tests.helpers.paths import ROOT
 from tests.helpers.training import fails, outcome, resume, run_train
-
-ROOT = Path(__file__).parents[2]
 
 
 def no_space(*args, **kwargs):

@@ -11,8 +11,7 @@ from sb3_tdc.cli import train
 from sb3_tdc.resume import ResumeStates
 from sb3_tdc.runs.callbacks import busy_machine
 from sb3_tdc.runs.callbacks.busy_machine import BusyMachine
-
-SMALL = ["policy_kwargs:{net_arch: [16, 16], n_quantiles: 5}", "learning_starts:100", "batch_size:16"]
+from tests.helpers.command_line import SMALL
 
 # Milliseconds and processor milliseconds of single updates on two threads, measured on two cores
 QUIET = [(2.9, 5.8), (4.4, 8.7)]
@@ -164,7 +163,7 @@ def busy(monkeypatch):
 
 def run_train(folder, *args):
     common = ["--env", "Pendulum-v1", "-n", "200", "--seed", "1", "-f", str(folder), "--eval-freq", "-1"]
-    return train.main([*common, "--device", "cpu", "-params", *SMALL, *args])
+    return train.main([*common, "--device", "cpu", *SMALL, *args])
 
 
 @pytest.mark.parametrize("bar", ["--progress", "--no-progress"])

@@ -4,15 +4,13 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.helpers.paths import ROOT
 from tests.helpers.saved_models import MODELS
 from tests.safe_load.attacks import ATTACKS
 from tests.safe_load.attacks.__main__ import peak, reset_peak
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

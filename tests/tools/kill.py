@@ -27,9 +27,9 @@ import numpy as np
 import yaml
 
 from sb3_tdc import TDC
+from tests.helpers.paths import ROOT
 from tests.tools.runs import digest, files
 
-ROOT = Path(__file__).parents[2]
 # train.py, that tells where it is when it is asked to (SIGUSR1), at once
 _CODE = """
 import faulthandler, signal, sys
