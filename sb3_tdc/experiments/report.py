@@ -4,16 +4,15 @@ One HTML file that needs no other, and the same figures (SVG, PNG, PDF) and tabl
 them. Reads only what runs have left; trains and plays nothing.
 """
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_tdc.advb.algorithms import Advised
 from sb3_tdc.common.words import count, listed
-from sb3_tdc.experiments import provenance
+from sb3_tdc.experiments import provenance, report_files
 from sb3_tdc.experiments.groups import Group, group_runs
 from sb3_tdc.experiments.results import Run
-from sb3_tdc.experiments.sections import LIST, Report
+from sb3_tdc.experiments.sections import Report
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 
@@ -55,15 +54,6 @@ def _describe_board(group: Group) -> str:
     return f"the board acts in evaluations. Its test episodes took {further} a run, which are not counted."
 
 
-def _remove_old(folder: Path) -> None:
-    """Remove figures and tables of an earlier report, and nothing else: some may be of runs that are gone."""
-    if (folder / LIST).is_file():
-        for name in (folder / LIST).read_text(encoding="utf-8").splitlines():
-            if re.fullmatch(r"(figures|tables)/[^/]+", name) and (folder / name).is_file():
-                (folder / name).unlink()
-        (folder / LIST).unlink()
-
-
 def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -> Path:
     """
     Write the page, its figures and its tables.
@@ -73,7 +63,7 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    _remove_old(folder)
+    report_files.remove_old(folder)
     groups = group_runs(runs)
     report = Report(groups, folder)
     sections = [

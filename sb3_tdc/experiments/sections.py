@@ -1,9 +1,6 @@
 """The sections of the report: each states what it shows, draws its figures and fills its tables."""
 
-import base64
-import io
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,26 +17,19 @@ from sb3_tdc.experiments.curves import bin_width, headline, make_curve, read_eva
 from sb3_tdc.experiments.final_episodes import EPISODES, read_test_returns
 from sb3_tdc.experiments.groups import Conditions, Group, by_conditions, shared_differences, vary
 from sb3_tdc.experiments.published_curves import published_curves
+from sb3_tdc.experiments.report_files import Picture, ReportFiles
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import ISAAC, MUJOCO, PYBULLET
 from sb3_tdc.experiments.variants import compare_variants
 
-# What a report has written next to its page, one path a line: the next report removes these
-LIST = "report_files.txt"
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure as the page shows it: :param svg: base64"""
-
-    name: str
-    caption: str
-    svg: str
-
 
 @dataclass
 class Section:
-    """A part of the page. :param tables: pairs of caption and cells to read"""
+    """
+    A part of the page.
+
+    :param tables: pairs of caption and cells to read
+    """
 
     title: str
     text: str
@@ -49,48 +39,20 @@ class Section:
 
 class Report:
     """
-    The sections of a page, in order, and the files next to it.
+    The sections of a page.
 
-    :param folder: where figures and tables are written
+    :param folder: where their figures and tables are written
     """
 
     def __init__(self, groups: Sequence[Group], folder: Path):
-        self.groups, self.folder = groups, folder
+        self.groups, self.files = groups, ReportFiles(folder)
         self.returns = tables.make_returns_table(groups)
         self.conditions = by_conditions(groups, (*MUJOCO, *PYBULLET, *ISAAC))
-
-    def new_file(self, name: str) -> Path:
-        """Return where a file of the report is written, and add it to the list."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with (self.folder / LIST).open("a", encoding="utf-8") as files:
-            files.write(f"{name}\n")
-        return path
-
-    def draw(self, name: str, caption: str, function: Callable[..., None], *args: Any, **kwargs: Any) -> Picture:
-        """Draw one figure by a function of axes and arrays, and write it as SVG, PNG and PDF."""
-        import matplotlib
-        from matplotlib.figure import Figure
-
-        with matplotlib.rc_context({"font.size": 9, "svg.hashsalt": name}):
-            figure = Figure(figsize=(4.8, 3.4), layout="constrained")
-            function(figure.subplots(), *args, **kwargs)
-            file = re.sub(r"[^\w.-]+", "_", name)
-            for suffix in ("png", "pdf"):
-                figure.savefig(self.new_file(f"figures/{file}.{suffix}"), dpi=200)
-            svg = io.BytesIO()
-            figure.savefig(svg, format="svg")
-        self.new_file(f"figures/{file}.svg").write_bytes(svg.getvalue())
-        return Picture(file, caption, base64.b64encode(svg.getvalue()).decode())
-
-    def write_table(self, name: str, table: pd.DataFrame) -> None:
-        """Write numbers as CSV."""
-        table.to_csv(self.new_file(f"tables/{name}.csv"), index=False)
 
     def add_table(self, section: Section, name: str, table: pd.DataFrame, caption: str = "") -> None:
         """Write a table of cells to read, and show it; an empty one is left out."""
         if len(table):
-            self.write_table(name, table)
+            self.files.write_table(name, table)
             section.tables.append((caption, table))
 
     def draw_learning_curves(
@@ -104,7 +66,7 @@ class Report:
             for group, label, color in zip(groups, labels, colors, strict=True)
         ]
         episodes = sorted({run.evaluations.returns.shape[1] for g in groups for run in g.runs if run.evaluations})
-        return self.draw(
+        return self.files.draw(
             f"{name}-{conditions.file_name}",
             f"{_about(conditions)}; bins of {width:,} steps. {_seeds(labels, [g.seeds for g in groups])} "
             f"{shared_differences(groups)}",
@@ -136,7 +98,7 @@ class Report:
         return section
 
     def returns_section(self) -> Section:
-        self.write_table("returns", self.returns)
+        self.files.write_table("returns", self.returns)
         section = Section(
             "Returns",
             "Of finished runs. ± is the standard deviation across seeds (none for one seed). Final: mean of the last "
@@ -157,11 +119,11 @@ class Report:
         labels, intervals, tasks = list(found.scores), found.intervals(), listed(found.env_ids)
         table = pd.DataFrame(intervals, columns=["iqm", "low", "high"])
         table = table.assign(algorithm=labels, tasks=tasks, length=found.length, mujoco=found.physics)
-        self.write_table(name, table)
+        self.files.write_table(name, table)
         physics = f", MuJoCo {found.physics}" if found.physics else ""
         left_out = f" Left out, for want of two seeds: {listed(found.left_out)}." if found.left_out else ""
         section.pictures.append(
-            self.draw(
+            self.files.draw(
                 name,
                 f"Final returns over {tasks}, {found.length}{physics}: interquartile mean of scores with its 95 % "
                 "stratified bootstrap interval. 0 and 1 are the lowest and highest single run on a task, of those that "
@@ -220,7 +182,7 @@ class Report:
     def draw_sweep(self, name: str, groups: Sequence[Group]) -> Picture:
         """Draw final returns against λ, of groups that differ in a fixed λ alone."""
         conditions, values = groups[0].conditions, [group.setting("lam") for group in groups]
-        return self.draw(
+        return self.files.draw(
             f"{name}-{conditions.file_name}",
             f"{_about(conditions)}. {_seeds([f'λ = {value:g}' for value in values], [g.seeds for g in groups])} "
             f"{shared_differences(groups)}",
@@ -244,7 +206,7 @@ class Report:
         return section
 
     def ablations(self, key: str) -> list[list[Group]]:
-        """Groups of TDC that differ in one setting alone."""
+        """Return groups of TDC that differ in one setting alone."""
         return vary([g for groups in self.conditions.values() for g in groups if g.algo == "tdc"], key)
 
     def td_errors(self) -> Section:
@@ -266,7 +228,7 @@ class Report:
             if not any(np.isfinite(curve.values).any() for curve in curves):
                 continue
             section.pictures.append(
-                self.draw(
+                self.files.draw(
                     f"td-error-variance-{conditions.file_name}",
                     f"{_about(conditions)}; bins of {width:,} steps. {_seeds(labels, [g.seeds for g in shown])} "
                     f"{shared_differences(shown)}",
@@ -298,7 +260,7 @@ class Report:
                 if len(returns) < len(group.finished)
             ]
             section.pictures.append(
-                self.draw(
+                self.files.draw(
                     f"test-returns-{conditions.file_name}",
                     f"After {_about(conditions)}. {_seeds(labels, [len(returns) for _, returns in played])} "
                     + (f"Without test episodes: {listed(missing)}. " if missing else "")
@@ -368,18 +330,18 @@ def read_all_test_returns(group: Group) -> np.ndarray:
 
 
 def _variants_and_controls(groups: Sequence[Group]) -> list[Group]:
-    """Of groups under the same conditions: ablations, and TDC as it is compared with them."""
+    """Return, of groups under the same conditions, ablations and TDC as it is compared with them."""
     compared = [c for c in compare_variants(groups) if c.variant.algo in ABLATIONS]
     shown = [group for comparison in compared for group in (comparison.variant, comparison.control)]
     return [group for group in groups if group in shown]
 
 
 def _about(conditions: Conditions) -> str:
-    """The number of steps, and the physics where they matter."""
+    """Return the number of steps, and the physics where they matter."""
     physics = f" with MuJoCo {conditions.mujoco}" if conditions.mujoco else ""
     return f"{conditions.n_timesteps:,} steps{physics}"
 
 
 def _seeds(labels: Sequence[str], seeds: Iterable[object]) -> str:
-    """Seeds of each line of a figure: ``"Seeds: TDC: 3 (1, 2, 3); SAC: 1 (1)."``."""
+    """List the seeds of each line of a figure: ``"Seeds: TDC: 3 (1, 2, 3); SAC: 1 (1)."``."""
     return "Seeds: " + "; ".join(f"{label}: {which}" for label, which in zip(labels, seeds, strict=True)) + "."
