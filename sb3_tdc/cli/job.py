@@ -26,7 +26,7 @@ def keep_niceness() -> None:
 
 
 def _die_with_parent() -> None:
-    """The other end of the standard input is the parent's: it closes when the parent dies, however it does."""
+    """End this process when its parent dies, however it does: the other end of the standard input closes then."""
     while os.read(0, 1):
         pass
     os.kill(os.getpid(), signal.SIGKILL)

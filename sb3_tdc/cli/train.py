@@ -105,7 +105,11 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def _report_failure(error: BaseException, folder: RunFolder) -> int:
-    """Print why a run ended and what to do. :return: the exit status"""
+    """
+    Print why a run ended and what to do.
+
+    :return: the exit status
+    """
     if isinstance(error, KeyboardInterrupt):
         print(f"Stopped without saving; what was saved before stays in {folder.path}", file=sys.stderr)
         return 130

@@ -173,7 +173,11 @@ def _search(args: argparse.Namespace, given: dict[str, Any]) -> int:
 
 
 def _run(args: argparse.Namespace, candidates: Sequence[Sequence[Job]]) -> int:
-    """Train the candidates, and rank them if all have come to their end. :return: the exit status"""
+    """
+    Train the candidates, and rank them if all have come to their end.
+
+    :return: the exit status
+    """
     print(
         f"{count(len(candidates), 'candidate')} × {count(args.seeds, 'seed')}, {count(args.n_timesteps, 'step')} each, "
         f"evaluated every {eval_freq(args.n_timesteps):,} (5 episodes); one CPU and one thread a seed; "

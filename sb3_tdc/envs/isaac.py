@@ -102,7 +102,7 @@ def _is_installed() -> bool:
 
 @contextmanager
 def _without_arguments() -> Iterator[None]:
-    """The application would read the arguments of ``sb3-tdc train`` as its own."""
+    """Hide the arguments of ``sb3-tdc train``, which the application would read as its own."""
     arguments, sys.argv = sys.argv, sys.argv[:1]
     try:
         yield

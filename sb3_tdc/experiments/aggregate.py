@@ -82,7 +82,7 @@ def choose(tasks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[s
 
 
 def _at_one_length(groups: Sequence[Group]) -> dict[tuple[str, str], dict[str, dict[str, Group]]]:
-    """By length and physics: for every algorithm and task its group. Lengths are numbers of steps and shares."""
+    """Return, by length and physics, the group of every algorithm and task. Lengths are numbers of steps and shares."""
     found: dict[tuple[str, str], dict[str, dict[str, Group]]] = {}
     for conditions, alike in by_conditions(group for group in groups if group.finished).items():
         for group in as_shipped(alike):

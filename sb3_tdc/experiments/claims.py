@@ -137,7 +137,7 @@ def late_td_error_variance(group: Group) -> Interval:
 
 
 def _scatter_of_late_evaluations(run: Run) -> float:
-    """The standard deviation about a straight line: a run that still improves does not scatter for that."""
+    """Return the standard deviation about a straight line: a run that still improves does not scatter for that."""
     late = run.late_evaluations()
     if len(late) < 3:
         return float("nan")
@@ -221,7 +221,7 @@ def _td_errors(groups: Sequence[Group]) -> Iterator[Claim]:
 
 
 def _baselines(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
-    """Pairs of TDC and a baseline on a task of the paper, both as ``hyperparams/`` has them."""
+    """Yield pairs of TDC and a baseline on a task of the paper, both as ``hyperparams/`` has them."""
     shipped = [group for group in as_shipped(groups) if group.env_id in (*MUJOCO, *PYBULLET)]
     for plain in (group for group in shipped if group.algo == "tdc"):
         for baseline in (group for group in shipped if group.algo in BASELINES):
@@ -229,7 +229,7 @@ def _baselines(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
 
 
 def _ablations(groups: Sequence[Group], key: str, *env_ids: str) -> list[list[Group]]:
-    """TDC as ``hyperparams/`` has it, but for one setting: ordered by it."""
+    """Yield TDC as ``hyperparams/`` has it, but for one setting: ordered by it."""
     return vary(
         (g for g in groups if g.algo == "tdc" and g.env_id in env_ids and is_as_shipped(g.runs[0], but={key})), key
     )

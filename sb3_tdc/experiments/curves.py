@@ -27,7 +27,7 @@ def headline(groups: Sequence[Group]) -> list[Group]:
 
 
 def bin_width(group: Group) -> int:
-    """20,000 steps, scaled; a multiple of the distance of the group's evaluations, so that every bin has as many."""
+    """Return 20,000 steps, scaled: a multiple of the group's evaluation interval, so that every bin has as many."""
     scale = group.n_timesteps / group.shipped_steps if group.shipped_steps else 1.0
     frequency = max(group.setting("eval_freq") or 0, 1)
     return max(round(_BIN * scale / frequency), 1) * frequency

@@ -53,7 +53,7 @@ def colors_of(labels: Sequence[str]) -> list[str]:
 
 
 def count_seeds(n: int, unfinished: int = 0) -> str:
-    """``"3 seeds, 1 unfinished"``."""
+    """Return ``"3 seeds, 1 unfinished"``."""
     text = count(n, "seed")
     return f"{text}, {unfinished} unfinished" if unfinished else text
 
@@ -67,8 +67,9 @@ def draw_curves(
     published: Sequence[PublishedCurve] = (),
 ) -> None:
     """
-    Mean over seeds with its 95 % t interval, every seed as a thin line; an unfinished one is dotted, a published mean
-    is dashed, and shown as far as ours go.
+    Draw the mean over seeds with its 95 % t interval, every seed as a thin line.
+
+    An unfinished one is dotted, a published mean is dashed, and shown as far as ours go.
 
     One seed has no interval; that of two can be huge, and runs off the axis, which is made for the seeds. On a
     logarithmic axis, means and intervals are those of the logarithms.
@@ -104,7 +105,7 @@ def draw_box_plots(
     axes: Any, labels: Sequence[str], colors: Sequence[Any], returns: Sequence[np.ndarray], title: str
 ) -> None:
     """
-    One box for each algorithm, over the episodes of all its runs (whiskers: 1.5 interquartile ranges); the mean of
+    Draw one box for each algorithm, over the episodes of all its runs (whiskers: 1.5 interquartile ranges); the mean of
     each run is a dot.
 
     :param returns: for each algorithm (runs, episodes)
@@ -162,7 +163,11 @@ def draw_intervals(
     title: str,
     xlabel: str,
 ) -> None:
-    """One row for each label: a point and its interval. :param intervals: point, low, high"""
+    """
+    Draw one row for each label: a point and its interval.
+
+    :param intervals: point, low, high
+    """
     for row, (color, (point, low, high)) in enumerate(zip(colors, intervals, strict=True)):
         axes.plot([low, high], [row, row], color=color, lw=6, alpha=0.3, solid_capstyle="butt")
         axes.plot(point, row, "o", color=color)
@@ -184,7 +189,7 @@ def _cut_intervals(axes: Any, values: np.ndarray, log: bool = False) -> None:
 
 
 def _finite(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Without empty bins, across which a line is drawn through."""
+    """Leave out empty bins, so that a line is drawn across them."""
     there = np.isfinite(values)
     return steps[there], values[there]
 

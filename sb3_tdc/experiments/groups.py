@@ -157,7 +157,7 @@ def by_conditions(groups: Iterable[Group], tasks: Sequence[str] = ()) -> dict[Co
 
 def vary(groups: Iterable[Group], key: str) -> list[list[Group]]:
     """
-    The ablations of one hyperparameter.
+    Return the ablations of one hyperparameter.
 
     :return: lists of at least two groups that differ in ``key`` alone, ordered by it
     """
@@ -244,7 +244,7 @@ def shared_differences(groups: Sequence[Group]) -> str:
 
 
 def describe(settings: Mapping[str, Any]) -> str:
-    """``{"lam": 0.5, "tau": 0.01}`` → "λ 0.5, tau 0.01"."""
+    """Describe settings: ``{"lam": 0.5, "tau": 0.01}`` → "λ 0.5, tau 0.01"."""
     return ", ".join(_describe(key, value) for key, value in settings.items())
 
 
@@ -276,7 +276,7 @@ def _conditions(run: Run) -> Conditions:
 
 
 def _label(run: Run, representatives: Sequence[Run]) -> str:
-    """The algorithm's name, and the settings that tell it from its likes and are not those of ``hyperparams/``."""
+    """Return the algorithm's name, and settings that tell it from its likes and are not those of ``hyperparams/``."""
     likes = [o for o in representatives if o.algo == run.algo and _conditions(o) == _conditions(run)]
     keys = {key for other in likes for key in other.settings}
     telling = {key for key in keys if len({canonical(other.setting(key)) for other in likes}) > 1}
@@ -286,7 +286,7 @@ def _label(run: Run, representatives: Sequence[Run]) -> str:
 
 def _identity(run: Run, without: str | None = None, algo: str | None = None) -> str:
     """
-    Everything but the seed; a default is the same whether it is given or not.
+    Return everything but the seed; a default is the same whether it is given or not.
 
     :param without: a setting to leave out
     :param algo: as if it were of this algorithm

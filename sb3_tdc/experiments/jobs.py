@@ -236,7 +236,7 @@ def check_address(address: str) -> None:
 @contextmanager
 def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
     """
-    Ray, as long as the context lasts.
+    Start Ray, as long as the context lasts.
 
     :param address: of a cluster that shares this file system; None for this machine
     :param n_jobs: how many jobs at once on this machine; None for as many as there are cores

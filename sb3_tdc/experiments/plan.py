@@ -48,7 +48,7 @@ def select(cells: Iterable[Cell], only: Sequence[str]) -> list[Cell]:
 
 def make_plan(cells: Sequence[Cell], seeds: Sequence[int], scale: float, logs: Path) -> Plan:
     """
-    Seed by seed, so that a matrix that is stopped early has something of every cell.
+    Make the plan seed by seed, so that a matrix that is stopped early has something of every cell.
 
     :param scale: the fraction of the suite's steps
     :param logs: of all runs; those of a scale, or of a number of steps, have a folder of their own
@@ -63,7 +63,11 @@ def make_plan(cells: Sequence[Cell], seeds: Sequence[int], scale: float, logs: P
 
 
 def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
-    """What a cell says that ``hyperparams/`` or a default says too is left out: cells of two suites may be one job."""
+    """
+    Make the job of a cell and a seed.
+
+    What a cell says that ``hyperparams/`` or a default says too is left out: cells of two suites may be one job.
+    """
     entry, _ = read_entry(hyperparams_file(cell.algo), cell.env_id)
     implied = {**default_settings(cell.algo), **entry}
     settings = {key: value for key, value in cell.settings.items() if not same_settings(implied.get(key), value)}

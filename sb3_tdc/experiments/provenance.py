@@ -54,7 +54,7 @@ def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
 
 
 def _count_seeds(runs: Sequence[Run]) -> str:
-    """``"3 (300,000 steps), 1 (100,000 steps), 2 not averaged"``; "–" without any."""
+    """Return ``"3 (300,000 steps), 1 (100,000 steps), 2 not averaged"``; "–" without any."""
     averaged: dict[int, set[int]] = {}
     others: dict[int, set[int]] = {}
     for run in runs:
@@ -79,7 +79,7 @@ def _why_absent(cell: Cell) -> str:
 
 
 def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFrame:
-    """Runs that are not averaged, and why; empty if there are none."""
+    """List runs that are not averaged, and why; empty if there are none."""
     rows = []
     for run in runs:
         if not run.is_complete or run.evaluations is None:
@@ -96,7 +96,7 @@ def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFr
 
 
 def describe_groups(groups: Sequence[Group]) -> pd.DataFrame:
-    """What of its hyperparameters is not in ``hyperparams/``, for every group."""
+    """Describe which hyperparameters of every group are not those of ``hyperparams/``."""
     return pd.DataFrame(
         [
             {
@@ -113,12 +113,12 @@ def describe_groups(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def _short(commit: str) -> str:
-    """``"0123456…, with uncommitted changes"`` → "0123456, with uncommitted changes"."""
+    """Shorten a commit: ``"0123456…, with uncommitted changes"`` → "0123456, with uncommitted changes"."""
     return re.sub(r"^([0-9a-f]{7})[0-9a-f]+", r"\1", commit) or "not known"
 
 
 def describe_runs(runs: Sequence[Run]) -> pd.DataFrame:
-    """Every run: its command, and what it was trained with."""
+    """Describe every run: its command, and what it was trained with."""
     rows = []
     for run in runs:
         elapsed = run.progress("time/time_elapsed")
@@ -136,7 +136,7 @@ def describe_runs(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def describe_machine() -> dict[str, str]:
-    """Of the machine and the code that made the report."""
+    """Describe the machine and the code that made the report."""
     versions = []
     for package in _PACKAGES:
         try:

@@ -67,13 +67,17 @@ def _place(run: Run, logs: Path) -> Path:
 
 
 def _check_is_copy(place: Path, run: Run) -> None:
-    """:raises ValueError: if there is a run in a place, and it is no earlier copy of the one to publish"""
+    """
+    Check that a run in a place, if there is one, is an earlier copy of the one to publish.
+
+    :raises ValueError: if it is another
+    """
     if not any(place.glob("*/args.yml")):
         return
     try:
         there = Run.open(place)
     except ValueError as error:
-        raise ValueError(f"{error}; remove {place} to publish it anew") from error
+        raise ValueError(f"{error}; remove {place} to publish it again") from error
     if there.folder.model.is_file() or place.samefile(run.folder.path):
         raise ValueError(f"{place} is itself a run, not the copy of one: choose another folder")
     check_same_run(place, *(_identity(one, _may_differ(there) | _may_differ(run)) for one in (there, run)))

@@ -24,7 +24,8 @@ class PublishedCurve:
     One algorithm on one task.
 
     :param steps: (points,), environment steps
-    :param mean: (points,), over seeds; :param std: (points,)
+    :param mean: (points,), over seeds
+    :param std: (points,), over seeds
     """
 
     source: str

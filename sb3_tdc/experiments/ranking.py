@@ -16,7 +16,7 @@ from sb3_tdc.hyperparams import hyperparams_file, read_entry
 
 def rank(candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> pd.DataFrame:
     """
-    The best first: by the mean over seeds of the mean of all evaluations, at the steps that all its seeds have.
+    Rank the best first: by the mean over seeds of the mean of all evaluations, at the steps that all its seeds have.
 
     A candidate with fewer steps than another (stopped early, or failed) comes after it.
 

@@ -258,7 +258,8 @@ def check_same_run(path: Path, here: Mapping[str, Any], wanted: Mapping[str, Any
     """
     Check that the run in a folder is the wanted one.
 
-    :param here: its settings; :param wanted: those of the wanted one
+    :param here: its settings
+    :param wanted: those of the wanted one
     :raises ValueError: if it is another run, naming what differs
     """
     differing = [key for key in {**here, **wanted} if not same_settings(here.get(key), wanted.get(key))]
@@ -268,7 +269,7 @@ def check_same_run(path: Path, here: Mapping[str, Any], wanted: Mapping[str, Any
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``{"policy_kwargs": {"n_quantiles": 64}}`` → ``{"policy_kwargs.n_quantiles": 64}``."""
+    """Flatten nested settings: ``{"policy_kwargs": {"n_quantiles": 64}}`` → ``{"policy_kwargs.n_quantiles": 64}``."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, dict) and value:

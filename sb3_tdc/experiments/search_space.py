@@ -42,7 +42,7 @@ class Distribution:
 
 def parse_space(texts: Sequence[str]) -> dict[str, list[Any] | Distribution]:
     """
-    ``["kappa:[1.0, 10.0]", "tau:loguniform(1e-4, 1e-2)"]`` → what to try of every hyperparameter.
+    Parse ``["kappa:[1.0, 10.0]", "tau:loguniform(1e-4, 1e-2)"]`` → what to try of every hyperparameter.
 
     :raises ValueError: for anything else
     """
@@ -84,7 +84,7 @@ def _parse_list(text: str, values: str) -> list[Any]:
 
 def make_candidates(space: Mapping[str, list[Any] | Distribution], n_samples: int, seed: int = 0) -> list[dict]:
     """
-    Every combination of the lists, each with every one of ``n_samples`` joint draws of the distributions.
+    Make every combination of the lists, each with every one of ``n_samples`` joint draws of the distributions.
 
     :return: each once; the same for the same arguments
     """

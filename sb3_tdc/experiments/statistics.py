@@ -20,7 +20,7 @@ def bin_edges(last_step: int, width: int) -> np.ndarray:
 
 def bin_means(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """
-    The mean of the values in every bin (edges[b], edges[b+1]]: step 20,000 belongs to the first 20,000.
+    Return the mean of the values in every bin (edges[b], edges[b+1]]: step 20,000 belongs to the first 20,000.
 
     :param steps: (n,)
     :param values: (n,)
@@ -38,7 +38,7 @@ def bin_means(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.nd
 
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Mean over runs and its confidence interval by Student's t, which is honest for the few seeds of RL.
+    Return the mean over runs and its confidence interval by Student's t, which is honest for the few seeds of RL.
 
     :param values: (runs, ...); NaN is left out
     :return: mean, low, high, each (...); the interval is NaN where there are fewer than two runs
@@ -54,7 +54,7 @@ def interval_of(
     mean: np.ndarray, std: np.ndarray, n: np.ndarray | int, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    The same of what is known by its summary.
+    Return the same of what is known by its summary.
 
     :param std: sample standard deviation over the runs; NaN for fewer than two
     :param n: how many runs there are
@@ -75,7 +75,7 @@ def final_return(returns: np.ndarray) -> float:
 
 def best_return(returns: np.ndarray) -> float:
     """
-    The mean of the best evaluation of one run. A maximum over noisy means: it flatters, the more the fewer episodes.
+    Return the mean of the best evaluation of one run: a maximum over noisy means flatters, the more the fewer episodes.
 
     :param returns: (evaluations, episodes)
     """
@@ -84,7 +84,7 @@ def best_return(returns: np.ndarray) -> float:
 
 def area_under_curve(steps: np.ndarray, returns: np.ndarray) -> float:
     """
-    Mean height of the learning curve of one run, by the trapezoidal rule between its first and last evaluation.
+    Return the mean height of one run's learning curve, by the trapezoidal rule between its first and last evaluation.
 
     :param steps: (evaluations,), increasing
     :param returns: (evaluations, episodes)
@@ -143,7 +143,7 @@ def holm(p_values: np.ndarray) -> np.ndarray:
 
 def interquartile_mean(*tasks: np.ndarray, axis: int = -1) -> np.ndarray:
     """
-    Mean of the middle half of the scores of all runs on all tasks; of fewer than four scores, that of all.
+    Return the mean of the middle half of the scores of all runs on all tasks; of fewer than four scores, that of all.
 
     :param tasks: each (..., runs) along ``axis``
     """
@@ -154,7 +154,7 @@ def iqm_interval(
     tasks: Sequence[np.ndarray], seed: int = 0, confidence: float = 0.95, resamples: int = 5_000
 ) -> tuple[float, float]:
     """
-    Stratified bootstrap of the interquartile mean: seeds are resampled within every task (percentile method).
+    Return a stratified bootstrap of the interquartile mean: seeds are resampled within every task (percentile method).
 
     Of a handful of seeds, resampling knows only those: the interval is then rather too narrow.
 
@@ -177,7 +177,7 @@ def iqm_interval(
 
 def normalise_scores(returns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """
-    Scores that can be averaged over tasks: 0 and 1 are the lowest and the highest single run on the task.
+    Return scores that can be averaged over tasks: 0 and 1 are the lowest and the highest single run on the task.
 
     :param returns: of one task, for every algorithm (runs,)
     :return: the same, between 0 and 1; all 0.5 if all runs are equal

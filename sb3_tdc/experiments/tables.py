@@ -24,7 +24,7 @@ _PUBLISHED = Path(__file__).with_name("published.yml")
 
 
 def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """One row for each group with a finished run, in units of return; NaN where one seed says nothing."""
+    """Make one row for each group with a finished run, in units of return; NaN where one seed says nothing."""
     rows = []
     for group in groups:
         curves = [run.evaluations for run in group.finished if run.evaluations is not None]
@@ -96,7 +96,7 @@ def show_returns(table: pd.DataFrame) -> pd.DataFrame:
 
 def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
     """
-    Our final returns, then what others have published, one row for each source and algorithm.
+    List our final returns, then what others have published, one row for each source and algorithm.
 
     :param table: of :func:`make_returns_table`
     """
@@ -140,7 +140,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """Ours after their last step, then each published algorithm after as many, by task and number of steps."""
+    """List ours after their last step, then each published algorithm after as many, by task and number of steps."""
     rows = []
     for conditions, alike in by_conditions((g for g in groups if g.finished), MUJOCO).items():
         published = [(curve, *curve.at(conditions.n_timesteps)) for curve in published_curves(conditions.env_id)]
@@ -173,7 +173,7 @@ _LAM_COLUMNS = (
 
 
 def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """One row for each group that logs what λ does: means over the last third of every run, and over its seeds."""
+    """Make one row for each group that logs what λ does: means over the last third of every run, and over its seeds."""
     rows = []
     for group in groups:
         logged = {title: _late_means(group.finished, column) * unit for column, title, unit in _LAM_COLUMNS}
@@ -193,12 +193,12 @@ def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def _late_means(runs: Sequence[Run], column: str) -> np.ndarray:
-    """(runs,), NaN where a run has not logged it"""
+    """Return (runs,), NaN where a run has not logged it"""
     return np.array([late.mean() if len(late := run.late(column)) else np.nan for run in runs])
 
 
 def _over_seeds(values: np.ndarray) -> str:
-    """``"87.2 ± 35"``; without a ± where there is one seed, or all have the same value."""
+    """Return ``"87.2 ± 35"``; without a ± where there is one seed, or all have the same value."""
     known = values[np.isfinite(values)]
     if not len(known):
         return "–"
@@ -208,7 +208,7 @@ def _over_seeds(values: np.ndarray) -> str:
 
 
 def _rounded(value: float, digits: int) -> str:
-    """113.4 with 2 digits → "110", and not "1.1e+02"."""
+    """Round for reading: 113.4 with 2 digits → "110", and not "1.1e+02"."""
     return f"{float(f'{value:.{digits}g}'):g}"
 
 
@@ -217,7 +217,7 @@ def _with_interval(mean: float, low: float, high: float) -> str:
 
 
 def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """One row for each comparison that a claim of the paper asks for, with its verdict."""
+    """Make one row for each comparison that a claim of the paper asks for, with its verdict."""
     rows = [
         {
             "Claim": claim.says,
@@ -234,7 +234,7 @@ def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """One row for each variant of TDC that is there next to its control."""
+    """Make one row for each variant of TDC that is there next to its control."""
     return pd.DataFrame(
         [
             {
@@ -261,7 +261,7 @@ def _of_seeds(interval: Interval) -> str:
 
 
 def number(value: float) -> str:
-    """Thousands separated; one decimal below 100; "–" for NaN."""
+    """Format a number: thousands separated; one decimal below 100; "–" for NaN."""
     if np.isnan(value):
         return "–"
     text = f"{value:,.1f}" if abs(value) < 100 and value != int(value) else f"{value:,.0f}"
@@ -269,7 +269,7 @@ def number(value: float) -> str:
 
 
 def plus_minus(mean: float, std: float) -> str:
-    """``"1,234 ± 56"``, without a ± of one seed."""
+    """Return ``"1,234 ± 56"``, without a ± of one seed."""
     return number(mean) if np.isnan(std) else f"{number(mean)} ± {number(std)}"
 
 
@@ -280,7 +280,7 @@ def _published_return(value: Any) -> str:
 
 
 def _per_task(values: dict[str, str]) -> str:
-    """One value if all tasks that have one have the same, else those of all, in the order of the columns."""
+    """Return one value if all tasks that have one have the same, else those of all, in the order of the columns."""
     if len(set(values.values())) == 1:
         return next(iter(values.values()))
     return " / ".join(values.get(task, "–") for task in TASKS)

@@ -22,7 +22,7 @@ _NAMES = {cls: name for name, cls in {"tdc": TDC, **ABLATIONS}.items()}
 
 
 def _parent(algo: str) -> str:
-    """The algorithm that an ablation derives from."""
+    """Return the algorithm that an ablation derives from."""
     return next(_NAMES[base] for base in ABLATIONS[algo].__mro__[1:] if base in _NAMES)
 
 
@@ -84,7 +84,7 @@ def _is_control(control: Group, variant: Group) -> bool:
 
 
 def _compare(variant: Group, control: Group) -> Comparison:
-    """With the p-value of this comparison alone."""
+    """Compare, with the p-value of this comparison alone."""
     ours, others = variant.late_returns, control.late_returns
     mean = statistics.mean(ours) - statistics.mean(others)
     if min(len(ours), len(others)) < 2:

@@ -206,11 +206,11 @@ class RunFolder:
         return self.path / self.env_name / "finished.yml"
 
     def mark_finished(self, n_timesteps: int) -> None:
-        """The last step has been done, and the model saved."""
+        """Record that the last step has been done, and the model saved."""
         _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
 
     def mark_unfinished(self) -> None:
-        """The run begins again."""
+        """Record that the run begins again."""
         self._finished.unlink(missing_ok=True)
 
     def checkpoints(self) -> dict[int, Path]:

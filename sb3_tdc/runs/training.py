@@ -1,4 +1,8 @@
-"""One run, from its settings to its saved model. Called by the command line, by the matrix and by tests."""
+"""
+One run, from its settings to its saved model.
+
+Called by the command line. The matrix starts processes of it; only its --dry-run trains here, to measure a rate.
+"""
 
 import sys
 import traceback

@@ -230,7 +230,7 @@ def test_a_run_is_published_again_after_what_may_be_changed_of_it(tmp_path, caps
     assert (published.n_timesteps, published.folder.config["kappa"]) == (2000, 2.0)
     (published.folder.path / "evaluations.npz").write_bytes(b"damaged")
     assert publish.main([logs, "-o", str(results)]) == 1
-    assert f"; remove {published.folder.path} to publish it anew" in capsys.readouterr().err
+    assert f"; remove {published.folder.path} to publish it again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", ["logs/tdc", "logs/tdc/Hopper-v4_1", "."])

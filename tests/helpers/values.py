@@ -115,7 +115,7 @@ def lent_by_numba(numbers):
 LENT = [lent_by_ctypes, lent_by_mmap, lent_by_numba, lambda numbers: np.asarray(Lends(numbers))]
 
 
-# What is made anew by every call
+# What every call makes again
 LEAVES: dict[str, Any] = {
     **{repr(v): (lambda v=v: v) for v in (None, True, False, 0, -1, 1.5, -0.0, np.inf, "", "text", b"", b"\0\xff")},
     "nan": lambda: float("nan"),
