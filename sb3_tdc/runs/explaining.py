@@ -6,9 +6,9 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tdc.critics.returns import steps_until_negligible
 from sb3_tdc.critics.episodes import record_episodes
 from sb3_tdc.critics.figures import write_explanation
+from sb3_tdc.critics.returns import steps_until_negligible
 from sb3_tdc.runs.trained import TrainedModel
 from sb3_tdc.tdc import TDC
 
