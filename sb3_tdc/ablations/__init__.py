@@ -25,6 +25,8 @@ _KAPPA_WEIGHT = 0.05
 class ShiftedTDC(TDC):
     """The abstract's other reading: the quantiles of the selected critic are moved down by λσ."""
 
+    color: ClassVar[str | None] = "#8C564B"
+
     def make_target(self, next_quantiles: th.Tensor, replay_data: ReplayBufferSamples, lam: float) -> Target:
         target = super().make_target(next_quantiles, replay_data, lam)
         discounts = discounts_of(replay_data, self.gamma)
@@ -45,6 +47,7 @@ class PessimisticTDC(CalibratedTDC):
         "_calibrated": SavedField(number(-MAX_LAM, MAX_LAM), is_required=False)
     }
     least: ClassVar[float] = -MAX_LAM
+    color: ClassVar[str | None] = "#9467BD"
 
     @property
     def pessimism(self) -> float:
@@ -62,6 +65,8 @@ class PessimisticTDC(CalibratedTDC):
 
 class ScaledKappaTDC(TDC):
     """κ follows the size of the errors that it bounds: a moving average of mean |y_j − z_k| at every 50th update."""
+
+    color: ClassVar[str | None] = "#BCBD22"
 
     def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
         super().diagnose_critics(current, target)

@@ -123,6 +123,7 @@ class CalibratedTDC(TDC):
     }
     captured_attributes: ClassVar[tuple[str, ...]] = (*TDC.captured_attributes, "_calibration")
     least: ClassVar[float] = 0.0
+    color: ClassVar[str | None] = "#000000"
     # Before the first calibration
     _calibrated: float = 0.0
     _calibrated_from: float | None = None

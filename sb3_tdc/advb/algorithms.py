@@ -69,6 +69,7 @@ class AdvBTD3(Advised, TD3):
     :param kwargs: those of SB3's TD3; ``formation_period``: episodes before the board also acts in training
     """
 
+    color: ClassVar[str | None] = "#8C564B"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": policies.TD3MlpPolicy,
         "CnnPolicy": policies.TD3CnnPolicy,
@@ -84,6 +85,7 @@ class AdvBSAC(Advised, SAC):
     :param kwargs: those of SB3's SAC; ``formation_period``: episodes before the board also acts in training
     """
 
+    color: ClassVar[str | None] = "#17BECF"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": policies.SACMlpPolicy,
         "CnnPolicy": policies.SACCnnPolicy,
@@ -101,6 +103,7 @@ class AdvBTDC(Advised, TDC):
     :param kwargs: those of TDC; ``formation_period``: episodes before the board also acts in training
     """
 
+    color: ClassVar[str | None] = "#9467BD"
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": policies.TDCMlpPolicy,
         "CnnPolicy": policies.TDCCnnPolicy,

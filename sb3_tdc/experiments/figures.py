@@ -2,6 +2,7 @@
 
 import itertools
 import textwrap
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -47,9 +48,21 @@ def wrap(label: str, width: int) -> str:
 
 
 def colors_of(labels: Sequence[str]) -> list[str]:
-    """Return a colour for each label of one figure: an algorithm has its own, the others take those that are left."""
-    others = itertools.cycle(OTHER_COLORS)
-    return [COLORS[label] if label in COLORS else next(others) for label in labels]
+    """
+    Return a colour for each label of one figure.
+
+    An algorithm has its own, with other settings too if it is there once; the others take those that are left.
+    """
+    times = Counter(map(_algorithm, labels))
+    names = {label: label if times[_algorithm(label)] > 1 else _algorithm(label) for label in labels}
+    own = {label: COLORS[name] for label, name in names.items() if name in COLORS}
+    others = itertools.cycle([color for color in OTHER_COLORS if color not in own.values()] or OTHER_COLORS)
+    return [own[label] if label in own else next(others) for label in labels]
+
+
+def _algorithm(label: str) -> str:
+    """``"TDC, λ 0"`` → "TDC"."""
+    return label.partition(",")[0]
 
 
 def count_seeds(n: int, unfinished: int = 0) -> str:
@@ -71,19 +84,20 @@ def draw_curves(
 
     An unfinished one is dotted, a published mean is dashed, and shown as far as ours go.
 
-    One seed has no interval; that of two can be huge, and runs off the axis, which is made for the seeds. On a
+    One seed has no interval; that of a few can be huge, and runs off the axis, which is made for the seeds. On a
     logarithmic axis, means and intervals are those of the logarithms.
     """
     if log:
         axes.set_yscale("log")
     for curve in curves:
-        for values, style in ((curve.values, "-"), (curve.unfinished, ":")):
-            for run in values:
-                axes.plot(*_finite(curve.steps, run), style, color=curve.color, lw=0.7, alpha=0.45)
+        for run in curve.values:
+            _draw_line(axes, curve.steps, run, color=curve.color, lw=0.7, alpha=0.45)
+        for run in curve.unfinished:
+            _draw_line(axes, curve.steps, run, ls=":", color=curve.color, lw=1.1, alpha=0.8)
         label = f"{wrap(curve.label, 44)} · {count_seeds(len(curve.values), len(curve.unfinished))}"
         values = np.log(curve.values) if log else curve.values
         mean, low, high = (np.exp(v) if log else v for v in mean_interval(values))
-        axes.plot(*_finite(curve.steps, mean), color=curve.color, lw=1.8, label=label)
+        _draw_line(axes, curve.steps, mean, color=curve.color, lw=1.8, label=label)
         axes.fill_between(curve.steps, low, high, color=curve.color, alpha=0.15, lw=0)
     shown = [v.ravel() for curve in curves for v in (curve.values, curve.unfinished)]
     last = max((curve.steps[-1] for curve in curves), default=0)
@@ -135,13 +149,15 @@ def draw_sweep(
     axes: Any, values: Sequence[float], returns: Sequence[np.ndarray], title: str, xlabel: str, color: Any
 ) -> None:
     """
-    Return against a hyperparameter: the mean over seeds with its 95 % t interval, every seed as a dot.
+    Return against a hyperparameter: the mean over seeds (a diamond) with its 95 % t interval, every seed as a dot.
+
+    The interval of a few seeds can be huge, and runs off the axis, which is made for the seeds.
 
     :param values: of the hyperparameter, increasing
     :param returns: for each value (runs,)
     """
     means, lows, highs = np.array([mean_interval(r) for r in returns]).T
-    axes.plot(values, means, "-", color=color, lw=1.8)
+    axes.plot(values, means, "D-", color=color, lw=1.8, ms=5)
     several = np.isfinite(lows)
     if several.any():
         x, y = np.asarray(values)[several], means[several]
@@ -188,10 +204,11 @@ def _cut_intervals(axes: Any, values: np.ndarray, log: bool = False) -> None:
     axes.set_ylim(max(low, lowest), min(high, highest))
 
 
-def _finite(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out empty bins, so that a line is drawn across them."""
+def _draw_line(axes: Any, steps: np.ndarray, values: np.ndarray, **style: Any) -> None:
+    """Draw a line across empty bins; a single value is a dot."""
     there = np.isfinite(values)
-    return steps[there], values[there]
+    marker = "o" if there.sum() == 1 else None
+    axes.plot(steps[there], values[there], marker=marker, ms=4, **style)
 
 
 def _short_number(number: float, _: int) -> str:

@@ -77,8 +77,8 @@ class Group:
 
     @property
     def finished(self) -> tuple[Run, ...]:
-        """Those that took all their steps and were evaluated: the only ones that are averaged."""
-        return tuple(run for run in self.runs if run.is_complete and run.evaluations)
+        """Those that took all their steps, with finite evaluations: the only ones that are averaged."""
+        return tuple(run for run in self.runs if run.is_averaged)
 
     @property
     def seeds(self) -> str:
@@ -268,7 +268,7 @@ def _shipped(algo: str, env_id: str) -> Mapping[str, Any]:
 
 
 def _rank(run: Run) -> int:
-    return run.is_finished + (run.is_complete and run.evaluations is not None)
+    return run.is_finished + run.is_averaged
 
 
 def _conditions(run: Run) -> Conditions:

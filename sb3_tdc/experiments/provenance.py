@@ -58,7 +58,7 @@ def _count_seeds(runs: Sequence[Run]) -> str:
     averaged: dict[int, set[int]] = {}
     others: dict[int, set[int]] = {}
     for run in runs:
-        kind = averaged if run.is_complete and run.evaluations is not None else others
+        kind = averaged if run.is_averaged else others
         kind.setdefault(run.n_timesteps, set()).add(run.seed)
     said = [f"{len(averaged[steps])} ({steps:,} steps)" for steps in sorted(averaged, reverse=True)]
     n_others = sum(len(seeds - averaged.get(steps, set())) for steps, seeds in others.items())
@@ -82,11 +82,13 @@ def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFr
     """List runs that are not averaged, and why; empty if there are none."""
     rows = []
     for run in runs:
-        if not run.is_complete or run.evaluations is None:
+        if not run.is_averaged:
             if run.is_finished and not run.is_complete:
                 why = "finished early: a callback ended it, or n_timesteps was edited afterwards"
-            elif run.is_finished:
+            elif run.is_finished and run.evaluations is None:
                 why = "finished, but was not evaluated"
+            elif run.is_finished:
+                why = "an evaluation has a return that is not finite"
             elif run.folder.model.is_file():
                 why = "stopped early; the model was saved"
             else:

@@ -62,6 +62,8 @@ class Run:
                 ),
             )
             run.n_timesteps  # noqa: B018  # must be there
+            if not all(isinstance(text, str) for text in (run.algo, run.env_id)) or type(run.seed) is not int:
+                raise TypeError(f"algo {run.algo!r}, env {run.env_id!r} or seed {run.seed!r} is of another type")
         except (OSError, KeyError, TypeError, AttributeError) as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise ValueError(f"{path} has no readable config.yml and args.yml ({reason})") from error
@@ -75,7 +77,7 @@ class Run:
         :raises ValueError: if a file is truncated or damaged
         """
         try:
-            _ = self.is_finished, self.evaluations, self.steps, self.system
+            _ = self.is_finished, self.evaluations, self.log, self.steps, self.system
         except (OSError, KeyError, TypeError, ValueError) as error:
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise ValueError(f"{self.folder.path} has a file that cannot be read ({reason})") from error
@@ -108,6 +110,11 @@ class Run:
     def is_complete(self) -> bool:
         """Return whether it has also taken all its steps: a callback may have ended it before."""
         return self.is_finished and self.steps >= self.n_timesteps
+
+    @property
+    def is_averaged(self) -> bool:
+        """Return whether it is complete and evaluated, each time with a finite return."""
+        return self.is_complete and self.evaluations is not None and bool(np.isfinite(self.evaluations.returns).all())
 
     @cached_property
     def evaluations(self) -> Evaluations | None:

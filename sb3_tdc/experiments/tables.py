@@ -85,7 +85,9 @@ def show_returns(table: pd.DataFrame) -> pd.DataFrame:
                 "Seeds": row["seeds"],
                 "Final": plus_minus(row["final_mean"], row["final_std"]),
                 "IQM [95 %]": interval,
-                "Lowest, highest seed": f"{number(row['final_min'])}, {number(row['final_max'])}",
+                "Lowest, highest seed": f"{number(row['final_min'])}, {number(row['final_max'])}"
+                if row["seeds"] > 1
+                else "–",
                 "Best": plus_minus(row["best_mean"], row["best_std"]),
                 "Mean of the curve": plus_minus(row["area_mean"], row["area_std"]),
                 "Test": test if row["test_seeds"] else "–",

@@ -1,12 +1,12 @@
 """
-Variants of TDC, each against the control that differs from it in one thing: does it help?
+Variants, each against the control that it is a change of: does it help?
 
 Compared is the mean of a run's evaluations in its last third, fixed before any run was made: less noisy than the last
 evaluation. Differences have Welch's interval over seeds; a verdict needs a p-value below 5 % after Holm's correction
 for the number of variants with several seeds, under the same conditions (task, number of steps, MuJoCo).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,13 @@ from scipy import stats
 
 from sb3_tdc.ablations import ABLATIONS
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.groups import Group, by_conditions, have_same_settings
+from sb3_tdc.experiments.groups import (
+    Group,
+    as_shipped,
+    by_conditions,
+    have_same_settings,
+    hyperparameters_not_shipped,
+)
 from sb3_tdc.tdc import TDC
 
 _LEVEL = 0.05
@@ -59,20 +65,47 @@ def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
     λ, fixed or calibrated (``tdc-auto``), is compared with λ = 0, and another ablation with the algorithm that it
     derives from, with the same hyperparameters.
     """
+    return _compare_all(groups, _variants)
+
+
+def compare_settings(groups: Sequence[Group]) -> list[Comparison]:
+    """
+    Return the comparisons of other hyperparameters with those of ``hyperparams/``, under all conditions.
+
+    Without λ and the head, which have their own.
+    """
+    return _compare_all(groups, _other_settings)
+
+
+def _compare_all(
+    groups: Sequence[Group], pairs: Callable[[Sequence[Group]], Iterator[tuple[Group, Group]]]
+) -> list[Comparison]:
+    """
+    Compare pairs under all conditions; those under the same ones are a family of Holm's correction.
+
+    :param pairs: finished groups under the same conditions → variants with their controls
+    """
     found = []
-    for alike in by_conditions(groups).values():
-        compared = [_compare(variant, control) for variant, control in _pairs(alike)]
+    for alike in by_conditions(group for group in groups if group.finished).values():
+        compared = [_compare(variant, control) for variant, control in pairs(alike)]
         corrected = statistics.holm(np.array([comparison.p for comparison in compared]))
         found += [replace(comparison, p=float(p)) for comparison, p in zip(compared, corrected, strict=True)]
     return found
 
 
-def _pairs(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
-    finished = [group for group in groups if group.finished]
+def _variants(finished: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
     for variant in finished:
         for control in (group for group in finished if group is not variant):
             if _is_control(control, variant):
                 yield variant, control
+
+
+def _other_settings(finished: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
+    controls = {control.algo: control for control in as_shipped(finished)}
+    for group in finished:
+        changed = set(hyperparameters_not_shipped(group.runs[0]))
+        if group.algo in controls and changed - {"lam", "stochastic_actor"}:
+            yield group, controls[group.algo]
 
 
 def _is_control(control: Group, variant: Group) -> bool:

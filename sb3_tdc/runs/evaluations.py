@@ -1,6 +1,7 @@
 """Read the evaluations that a run has left."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -26,7 +27,19 @@ def read_evaluations(run: RunFolder) -> Evaluations | None:
     Read the evaluations of a run.
 
     :return: None if it has not been evaluated
-    :raises ValueError: if the file cannot be read
+    :raises ValueError: if the file cannot be read, or has something else than returns of evaluations
     """
     path = run.evaluations
-    return Evaluations(*read_arrays(path, "timesteps", "results")) if path.is_file() else None
+    if not path.is_file():
+        return None
+    evaluations = Evaluations(*read_arrays(path, "timesteps", "results"))
+    _check(evaluations, path)
+    return evaluations
+
+
+def _check(evaluations: Evaluations, path: Path) -> None:
+    timesteps, returns = evaluations.timesteps, evaluations.returns
+    are_numbers = all(np.issubdtype(values.dtype, np.number) for values in (timesteps, returns))
+    if not are_numbers or returns.ndim != 2 or not returns.size or timesteps.shape != returns.shape[:1]:
+        found = f"{timesteps.dtype} {timesteps.shape} and {returns.dtype} {returns.shape}"
+        raise ValueError(f"{path} must have one step and at least one return for each evaluation, got arrays of {found}")

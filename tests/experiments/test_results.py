@@ -41,6 +41,60 @@ def test_a_damaged_file_is_listed_and_the_others_are_read(tmp_path, name, damage
     assert str(broken.path) in unreadable[0]
 
 
+@pytest.mark.parametrize("row", ["1,2,3,4,5,6\n", '"\n', "\udcff\n"])
+def test_a_damaged_log_is_listed(tmp_path, row):
+    broken = make_run(tmp_path, seed=1, log={"train/lam": [1.0, 2.0]})
+    make_run(tmp_path, seed=2)
+    with (broken.path / "progress.csv").open("a", errors="surrogateescape") as log:
+        log.write(row)
+    runs, (unreadable,) = find_runs(tmp_path)
+    assert [run.seed for run in runs] == [2]
+    assert str(broken.path) in unreadable
+
+
+@pytest.mark.parametrize(
+    ("timesteps", "results"),
+    [
+        ([10, 20, 30], [[1.0], [2.0]]),
+        ([10, 20], [1.0, 2.0]),
+        ([[10, 20]], [[1.0]]),
+        ([], np.empty((0, 5))),
+        ([10], np.empty((1, 0))),
+        ([10], [["a"]]),
+        (["a"], [[1.0]]),
+    ],
+)
+def test_evaluations_without_sense_are_listed(tmp_path, timesteps, results):
+    broken = make_run(tmp_path, seed=1)
+    make_run(tmp_path, seed=2)
+    np.savez(broken.path / "evaluations.npz", timesteps=timesteps, results=results)
+    runs, (unreadable,) = find_runs(tmp_path)
+    assert [run.seed for run in runs] == [2]
+    assert str(broken.path) in unreadable
+    assert "evaluations.npz" in unreadable
+
+
+@pytest.mark.parametrize("seed", ["one", None, 1.5, [1], True])
+def test_a_seed_that_is_no_number_is_listed(tmp_path, seed):
+    make_run(tmp_path, seed=seed)
+    make_run(tmp_path, seed=2)
+    runs, (unreadable,) = find_runs(tmp_path)
+    assert [run.seed for run in runs] == [2]
+    assert "seed" in unreadable
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_run_with_a_return_that_is_not_finite_is_not_averaged_anywhere(tmp_path, value):
+    make_run(tmp_path, seed=1, returns=((1.0, 3.0), (2.0, 4.0)))
+    make_run(tmp_path, seed=2, returns=((1.0, 3.0), (2.0, value)))
+    runs, _ = find_runs(tmp_path)
+    (group,) = group_runs(runs)
+    assert group.seeds == "1 (1)"
+    assert group.final_returns.tolist() == [3.0]
+    (why,) = provenance.list_unfinished(runs, [])["Why"]
+    assert why == "an evaluation has a return that is not finite"
+
+
 @pytest.mark.parametrize(
     ("entries", "reason"),
     [

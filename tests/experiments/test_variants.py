@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sb3_tdc.experiments import sections, statistics, tables
+from sb3_tdc.experiments import figures, sections, statistics, tables
 from sb3_tdc.experiments.groups import group_runs
 from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.suites import LAMBDA
-from sb3_tdc.experiments.variants import compare_variants
+from sb3_tdc.experiments.variants import compare_settings, compare_variants
 from tests.helpers.run_folders import make_run
 
 
@@ -167,3 +167,56 @@ def test_a_schedule_has_its_curve_next_to_the_numbers(tmp_path):
     assert [picture.name for picture in section.pictures] == [f"lambda-curves-1-{where}", f"lambda-sweep-1-{where}"]
     assert "λ = lin_1.0: 2 (1, 2)" in section.pictures[0].caption
     assert (tmp_path / "report" / "tables" / "variants.csv").is_file()
+
+
+def test_other_settings_are_compared_with_those_of_the_file(tmp_path):
+    """λ and the head alone have comparisons of their own; without a control nothing is compared."""
+    late = [(1.0, 2.0), (2.0, 3.0), (4.0, 9.0)]
+    for algo, config in (
+        ("tdc", {}),
+        ("tdc", {"lam": 0.0}),
+        ("tdc", {"stochastic_actor": True}),
+        ("tdc", {"kappa": 10.0}),
+        ("tdc", {"learning_rate": 3e-4, "qf_learning_rate": 3e-4}),
+        ("tdc", {"lam": 0.0, "kappa": 10.0}),
+        ("td3", {}),
+        ("td3", {"learning_starts": 25_000}),
+        ("sac", {"tau": 0.5}),
+    ):
+        make_runs(tmp_path, late, algo, **config)
+    make_runs(tmp_path, late, "tdc", kappa=10.0, env_id="Walker2d-v4")
+    found = compare_settings(group_runs(find_runs(tmp_path)[0]))
+    assert {(c.variant.label, c.control.label) for c in found} == {
+        ("TDC, kappa 10", "TDC"),
+        ("TDC, learning_rate 0.0003, qf_learning_rate 0.0003", "TDC"),
+        ("TDC, λ 0, kappa 10", "TDC"),
+        ("TD3, learning_starts 25,000", "TD3, learning_starts 100"),
+    }
+
+
+def test_other_settings_by_scipy(tmp_path):
+    make_runs(tmp_path, [(1.0, 3.0), (2.0, 6.0), (5.0, 7.0)])
+    make_runs(tmp_path, [(11.0, 13.0), (12.0, 14.0), (14.0, 18.0)], kappa=10.0)
+    make_runs(tmp_path, [(4.0, 4.0), (2.0, 9.0), (5.0, 3.0)], kappa=100.0)
+    found = {c.variant.setting("kappa"): c for c in compare_settings(group_runs(find_runs(tmp_path)[0]))}
+    control = [2.0, 4.0, 6.0]  # means of the two late evaluations
+    p = {10: stats.ttest_ind([12.0, 13.0, 16.0], control, equal_var=False).pvalue}
+    p[100] = stats.ttest_ind([4.0, 5.5, 4.0], control, equal_var=False).pvalue
+    assert p[10] < p[100]
+    assert found[10].p == pytest.approx(2 * p[10])  # Holm: the smaller of two
+    assert found[100].p == pytest.approx(p[100])
+    assert found[10].difference[0] == pytest.approx(41 / 3 - 4)
+    assert (found[10].verdict, found[100].verdict) == ("better", "undecided")
+
+
+def test_an_algorithm_has_one_colour_in_all_figures():
+    def colors(*labels):
+        return dict(zip(labels, figures.colors_of(labels), strict=True))
+
+    few = colors("TDC, λ 0", "TDC-AUTO, λ 1", "TDC-KAPPA, λ 1")
+    many = colors("TDC", "TDC, λ 0", "TDC-AUTO", "TDC-SHIFT", "TDC-PESSIMISM", "TDC-KAPPA")
+    assert few["TDC-AUTO, λ 1"] == many["TDC-AUTO"]
+    assert few["TDC-KAPPA, λ 1"] == many["TDC-KAPPA"]
+    assert colors("TD3", "ADVB_SAC")["ADVB_SAC"] == colors("ADVB_SAC", "ADVB_TD3")["ADVB_SAC"]
+    assert len(set(many.values())) == len(many)
+    assert len(set(colors("TDC", "TDC, λ 0", "TDC, λ 1", "TDC-AUTO", "MEOW", "TD3", "SAC").values())) == 7
