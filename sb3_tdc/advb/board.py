@@ -1,5 +1,6 @@
 """A cooperative advisory board: the best actors of a training so far advise, and a critic chooses."""
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch as th
@@ -34,10 +35,12 @@ class Board(nn.Module):
         Take a copy of an actor before the first member with a smaller return; the last of a full board leaves.
 
         :param actor: whose weights are copied
-        :param test_return: its return in a test episode
+        :param test_return: its return in a test episode; none that is not finite is taken
         :return: the seat that it gets, 0 for the best; None for none
         """
         test_return = float(test_return)  # VecMonitor's are numbers of NumPy
+        if not math.isfinite(test_return):
+            return None
         taken = self.returns[: len(self)].tolist()
         seat = next((i for i, other in enumerate(taken) if test_return > other), len(taken))
         if seat == len(self.members):

@@ -55,6 +55,7 @@ def observations(n=50):
         ([2.0, 1.0, 3.0, -4.0], [3.0, 2.0, 1.0]),  # −4 finds no seat
         ([1.0, 2.0, 3.0, 2.5], [3.0, 2.5, 2.0]),  # 1 leaves
         ([1.0, 2.0, 3.0, 9.0, 8.0], [9.0, 8.0, 3.0]),
+        ([np.nan, 1.0, np.inf, 2.0, -np.inf], [2.0, 1.0]),  # nothing would ever be above NaN
     ],
 )
 def test_members_are_ordered_by_their_returns(algorithm, returns, expected):
