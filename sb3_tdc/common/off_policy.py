@@ -26,6 +26,9 @@ from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
 
+# A schedule that ends at 0, as SB3's LinearSchedule, may be below it by the rounding of its arithmetic
+_ROUNDING = 1e-12
+
 
 def discounts_of(replay_data: ReplayBufferSamples, gamma: float) -> th.Tensor | float:
     """
@@ -100,7 +103,9 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
             return check_number(name, value, 0.0)
         # A run overshoots its end by the rest of its last rollout; a schedule is for a progress between 1 and 0
         progress = max(self._current_progress_remaining, 0.0) if progress_remaining is None else progress_remaining
-        return check_number(f"{name} (a schedule, at progress remaining {progress:.4g})", value(progress), 0.0)
+        described = f"{name} (a schedule, at progress remaining {progress:.4g})"
+        number = check_number(described, value(progress))
+        return 0.0 if -_ROUNDING < number < 0 else check_number(described, number, 0.0)
 
     def _current_lr_schedule(self) -> Schedule:
         """Return SB3's ``lr_schedule``, made again from ``learning_rate`` where that has been changed since."""

@@ -22,6 +22,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
@@ -75,6 +76,22 @@ def test_a_schedule_is_asked_for_a_progress_between_1_and_0(kwargs):
     model.learn(100)
     assert model.num_timesteps > 100
     assert (max(asked), min(asked)) == (1.0, 0.0)
+
+
+def test_sb3s_linear_schedule_to_zero_is_zero_at_its_end():
+    """Rounding makes it −5e-20 at 5 % of progress remaining, which no learning rate may be."""
+    schedule = LinearSchedule(3e-4, 0.0, 0.95)
+    asked = []
+
+    def recorded(progress):
+        asked.append(schedule(progress))
+        return asked[-1]
+
+    rates = []
+    model = make(learning_rate=recorded, qf_learning_rate=schedule, lam=schedule)
+    model.learn(200, callback=Each(lambda model: rates.append(model.critic.optimizer.param_groups[0]["lr"])))
+    assert min(asked) < 0  # or the test would be of nothing
+    assert min(rates) == 0
 
 
 @pytest.mark.parametrize("convert", [np.array, th.tensor, np.float32, lambda x: th.tensor([x])], ids=str)
