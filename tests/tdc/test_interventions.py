@@ -1,6 +1,7 @@
 """Whatever a user does to a model counts from the next update on, with the fused update as with the readable one."""
 
 import copy
+import inspect
 import pickle
 from multiprocessing import shared_memory
 from typing import NamedTuple
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.distributions import DiagGaussianDistribution, SquashedDiagGaussianDistribution
+from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.sac import policies as sac_policies
 from torch import nn
 from torch.nn.modules.module import register_module_forward_hook
@@ -17,7 +20,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from sb3_tdc import TDC
 from sb3_tdc.tdc.fused.replay import PackedReplay
-from sb3_tdc.tdc.policies import TanhGaussian
+from sb3_tdc.tdc.policies import QuantileCritic, TanhGaussian
 from tests.helpers.tdc import ACT, HEADS, BatchQueue, TwoActions, assert_close, make, make_model, random_batches, states
 
 CALLS: list[str] = []
@@ -303,6 +306,11 @@ def test_global_hooks_are_called(register):
     [
         (nn.Linear, "forward"),
         (TanhGaussian, "log_prob_from_params"),
+        (SquashedDiagGaussianDistribution, "log_prob"),
+        (DiagGaussianDistribution, "log_prob"),
+        (DiagGaussianDistribution, "proba_distribution"),
+        (BaseModel, "extract_features"),
+        (QuantileCritic, "extract_features"),
         (th.optim.Adam, "step"),
         (TDC, "_sample_target_actions"),
         (TDC, "predict"),
@@ -323,6 +331,32 @@ def test_a_method_replaced_on_a_class_is_called(place, name, monkeypatch):
     train(model, 2)
     model._last_obs = np.zeros((1, 3), np.float32)
     model._sample_action(0)
+    assert name in CALLS
+
+
+@pytest.mark.parametrize(
+    ("network", "name"),
+    [
+        *(
+            ("actor", name)
+            for name in ("log_prob_from_params", "actions_from_params", "log_prob", "proba_distribution")
+        ),
+        *(("actor_target", name) for name in ("actions_from_params", "proba_distribution")),  # its density is not used
+    ],
+)
+def test_a_method_replaced_on_a_distribution_is_called(network, name):
+    model = make_model(stochastic_actor=True)
+    train(model, 1)
+    assert model._fused_update is not None
+    distribution = getattr(model, network).action_dist
+    own = getattr(distribution, name)
+
+    def replacement(*args, **kwargs):
+        CALLS.append(name)
+        return own(*args, **kwargs)
+
+    setattr(distribution, name, replacement)
+    train(model, 2)
     assert name in CALLS
 
 
@@ -424,14 +458,40 @@ def test_two_models_share_the_rows_of_one_buffer():
     assert PackedReplay.of(buffer).holds(buffer)
 
 
-def test_a_sample_replaced_on_the_class_is_called(monkeypatch):
+@pytest.mark.parametrize("name", ["_get_samples", "_normalize_obs", "_normalize_reward", "to_torch"])
+@pytest.mark.parametrize("on_class", [True, False], ids=["class", "instance"])
+def test_a_method_of_the_buffer_that_is_replaced_is_called(name, on_class, monkeypatch):
     model = make(TwoActions(), fused=True)
     model.replay_buffer = plain_buffer()
     model.train(2, 8)
-    own = ReplayBuffer._get_samples
-    monkeypatch.setattr(ReplayBuffer, "_get_samples", lambda *a, **k: CALLS.append("samples") or own(*a, **k))
+    assert model._fused_update.packed_replay is not None
+    place = ReplayBuffer if on_class else model.replay_buffer
+    own = inspect.getattr_static(ReplayBuffer, name)
+    called = own.__func__ if isinstance(own, staticmethod) else getattr(place, name)
+
+    def replacement(*args, **kwargs):
+        CALLS.append(name)
+        return called(*args, **kwargs)
+
+    is_static = on_class and isinstance(own, staticmethod)
+    monkeypatch.setattr(place, name, staticmethod(replacement) if is_static else replacement)
     model.train(2, 8)
-    assert CALLS == ["samples"] * 2
+    assert CALLS.count(name) >= 2
+
+
+def test_an_array_of_the_buffer_that_is_kept_elsewhere_stays_the_buffer_s():
+    """Whoever has it may write to it, and what is written is learned from."""
+    for view in (slice(None), slice(0, 3)):
+        buffer = plain_buffer()
+        kept = buffer.rewards[view] if view.stop else buffer.rewards
+        model = make(TwoActions(), fused=True)
+        model.replay_buffer = buffer
+        model.train(2, 8)
+        kept[0] = 123.0
+        assert buffer.rewards[0] == 123
+        del kept
+        model.train(2, 8)
+        assert model._fused_update.packed_replay.holds(buffer)  # nobody keeps it any more
 
 
 def test_a_policy_in_shared_memory_stays_there():

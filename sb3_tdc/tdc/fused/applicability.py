@@ -5,6 +5,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.sac import policies as sac_policies
 from stable_baselines3.sac.policies import Actor as TanhGaussianActor
@@ -25,15 +26,17 @@ from sb3_tdc.tdc.policies import (
 
 th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
 
+_DENSITY = ("proba_distribution", "log_prob", "sample", "mode")
 # Methods whose work the fused update does itself, as they were when this module was imported: class → name → function
 REPLACED_METHODS: dict[type, dict[str, Any]] = {
     cls: {name: getattr(cls, name) for name in names}
     for cls, names in {
-        TDCPolicy: ("predict", "_predict"),
-        DeterministicActor: ("forward", "_predict"),
-        TanhGaussian: ("actions_from_params", "log_prob_from_params"),
-        TanhGaussianActor: ("forward", "_predict", "get_action_dist_params", "action_log_prob"),
-        QuantileCritic: ("forward", "q1_forward"),
+        TDCPolicy: ("predict", "_predict", "obs_to_tensor", "unscale_action", "extract_features"),
+        DeterministicActor: ("forward", "_predict", "extract_features"),
+        TanhGaussian: ("actions_from_params", "log_prob_from_params", "get_actions", *_DENSITY),
+        DiagGaussianDistribution: _DENSITY,
+        TanhGaussianActor: ("forward", "_predict", "get_action_dist_params", "action_log_prob", "extract_features"),
+        QuantileCritic: ("forward", "q1_forward", "extract_features"),
         StackedLinear: ("forward", "forward_first"),
         **dict.fromkeys((nn.Sequential, nn.Linear, nn.ReLU, nn.Tanh, nn.Flatten, FlattenExtractor), ("forward",)),
         nn.Module: ("__call__",),
@@ -98,6 +101,8 @@ def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
         for method in _replaced_methods(module):
             yield f"{method} of a module of the {name} is replaced"
     if isinstance(network, TanhGaussianActor):
+        for method in _replaced_methods(network.action_dist):
+            yield f"{method} of the {name}'s distribution is replaced"
         constants = constants_of(network.action_dist)
         if constants != (LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON):
             yield f"the limits of log σ, or the ε of its density, are not those of SB3: {constants}"
@@ -113,9 +118,9 @@ def constants_of(distribution: Any) -> tuple[float, ...]:
     return sac_policies.LOG_STD_MIN, sac_policies.LOG_STD_MAX, distribution.epsilon
 
 
-def _replaced_methods(module: nn.Module) -> list[str]:
+def _replaced_methods(instance: Any) -> list[str]:
     """Return the methods of a class that are others on this instance."""
-    return [name for name in vars(module) if callable(getattr(type(module), name, None))]
+    return [name for name in vars(instance) if callable(getattr(type(instance), name, None))]
 
 
 def _stacks(network: Any) -> list[Any] | None:

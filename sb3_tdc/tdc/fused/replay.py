@@ -1,5 +1,6 @@
 """A replay buffer whose transitions lie in one place each."""
 
+import sys
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
@@ -7,8 +8,11 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
 _ARRAYS = ("observations", "actions", "next_observations", "rewards", "dones", "timeouts")
-# The methods of SB3 that this replaces: if a user has replaced them, it does not apply
-_METHODS = {name: getattr(ReplayBuffer, name) for name in ("sample", "_get_samples")}
+# The methods of SB3 whose work this does: if a user has replaced them, it does not apply
+_METHODS = {
+    name: getattr(ReplayBuffer, name)
+    for name in ("sample", "_get_samples", "_normalize_obs", "_normalize_reward", "to_torch")
+}
 
 
 def row_widths(obs_dim: int, action_dim: int) -> list[int]:
@@ -62,7 +66,7 @@ class PackedReplay:
             and not buffer.optimize_memory_usage
             and buffer.observations.ndim == 3
             and buffer.observations.dtype.kind == buffer.actions.dtype.kind == "f"
-            and all(_is_private(getattr(buffer, name)) for name in _ARRAYS)
+            and all(_is_private(buffer, name) for name in _ARRAYS)
         )
 
     def holds(self, buffer: ReplayBuffer) -> bool:
@@ -84,7 +88,7 @@ class PackedReplay:
         """
         if self.rows is not self.host_rows:
             self._copy_new_rows(buffer, steps)
-        indices = np.random.randint(0, buffer.size(), size=n)
+        indices = np.random.randint(0, buffer.buffer_size if buffer.full else buffer.pos, size=n)
         if buffer.n_envs > 1:  # of one, SB3 draws nothing
             indices = indices * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=(n,))
         return indices
@@ -124,6 +128,11 @@ def _samples_plainly(buffer: ReplayBuffer) -> bool:
     return own and _METHODS.keys().isdisjoint(vars(buffer))
 
 
-def _is_private(array: np.ndarray) -> bool:
+def _is_private(buffer: ReplayBuffer, name: str) -> bool:
+    """Return whether an array of the buffer has memory of its own, and nothing else refers to it."""
+    array = vars(buffer)[name]
     # An array that was unpickled may lie in bytes, which nobody can write to
-    return type(array) is np.ndarray and (array.base is None or isinstance(array.base, bytes))
+    owns_memory = type(array) is np.ndarray and (array.base is None or isinstance(array.base, bytes))
+    del array
+    alone = {name: np.empty(0)}
+    return owns_memory and sys.getrefcount(vars(buffer)[name]) <= sys.getrefcount(alone[name])

@@ -91,7 +91,7 @@ class Snapshot:
         self.options = [(list(params), *rest) for params, *rest in map(_options_of, self.groups)]
         self.learning = [parameter for params, *_ in self.options for parameter in params]
         parts = [*policy.modules(), *self.modules.distributions, *optimizers]
-        classes = {nn.Module, *map(type, parts)} & REPLACED_METHODS.keys()
+        classes = {cls for part in parts for cls in type(part).__mro__} & REPLACED_METHODS.keys()
         self.methods_of = [(cls, operator.attrgetter(*REPLACED_METHODS[cls])) for cls in classes]
         self.methods = [methods_of(cls) for cls, methods_of in self.methods_of]
         self.overridden = model.overridden_methods
