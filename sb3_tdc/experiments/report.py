@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sb3_tdc.advb.algorithms import Advised
 from sb3_tdc.common.words import count, listed
-from sb3_tdc.experiments import provenance, report_files
+from sb3_tdc.experiments import provenance
 from sb3_tdc.experiments.groups import Group, group_runs
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.sections import Report
@@ -41,7 +41,7 @@ def make_warnings(groups: Sequence[Group]) -> list[str]:
     if mixed := [f"{g.label} on {g.conditions}" for g in groups if len(g.commits) > 1]:
         said.append(
             f"Seeds of {count(len(mixed), 'group')} were trained by several commits of sb3_tdc ({listed(mixed)}): "
-            "see the commits below, and what changed between them."
+            "see the commits below."
         )
     advised = [g for g in groups if g.finished and issubclass(KNOWN_ALGORITHMS.get(g.algo, object), Advised)]
     said += [f"{g.label} on {g.conditions}: {_describe_board(g)}" for g in advised]
@@ -50,8 +50,10 @@ def make_warnings(groups: Sequence[Group]) -> list[str]:
 
 def _describe_board(group: Group) -> str:
     steps = [int(logged[-1]) for run in group.finished if len(logged := run.progress("board/test_steps"))]
-    further = f"up to {max(steps):,} further environment steps" if steps else "further steps that the log does not give"
-    return f"the board acts in evaluations. Its test episodes took {further} a run, which are not counted."
+    further = f"up to {max(steps):,}" if steps else "an unknown number of"
+    return (
+        f"the board acts in evaluations. Its test episodes took {further} further environment steps a run, not counted."
+    )
 
 
 def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -> Path:
@@ -63,7 +65,6 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    report_files.remove_old(folder)
     groups = group_runs(runs)
     report = Report(groups, folder)
     sections = [
@@ -72,6 +73,7 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
         report.test_returns(),
         report.lambda_sweep(),
         report.heads(),
+        report.other_settings(),
         report.td_errors(),
         report.claims(),
         report.published(),
@@ -83,12 +85,15 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     page = environment.get_template("report.html").render(
         sections=sections,
         warnings=make_warnings(groups),
-        counts={
-            "finished runs": sum(run.is_finished for run in runs),
-            "unfinished": sum(not run.is_finished for run in runs),
-            "environments": len({run.env_id for run in runs}),
-            "sets of seeds": len(groups),
-        },
+        counts=[
+            count(n, noun).split(" ", 1)
+            for n, noun in (
+                (sum(run.is_finished for run in runs), "finished run"),
+                (sum(not run.is_finished for run in runs), "unfinished run"),
+                (len({run.env_id for run in runs}), "environment"),
+                (len(groups), "group"),
+            )
+        ],
         groups=provenance.describe_groups(groups),
         runs=provenance.describe_runs(runs),
         machine=provenance.describe_machine(),
@@ -96,4 +101,5 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
+    report.files.remove_old()
     return path

@@ -36,12 +36,14 @@ class ReportFiles:
 
     def __init__(self, folder: Path):
         self.folder = folder
+        self.names: list[str] = []
 
     def new_file(self, name: str) -> Path:
         """Return where a file of the report is written, and add it to the list."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        with (self.folder / _LIST).open("a", encoding="utf-8") as files:
+        self.names.append(name)
+        with (self.folder / _LIST).open("a", encoding="utf-8") as files:  # known even if the report stops half-way
             files.write(f"{name}\n")
         return path
 
@@ -65,11 +67,9 @@ class ReportFiles:
         """Write numbers as CSV."""
         table.to_csv(self.new_file(f"tables/{name}.csv"), index=False)
 
-
-def remove_old(folder: Path) -> None:
-    """Remove figures and tables of an earlier report, and nothing else: some may be of runs that are gone."""
-    if (folder / _LIST).is_file():
-        for name in (folder / _LIST).read_text(encoding="utf-8").splitlines():
-            if re.fullmatch(r"(figures|tables)/[^/]+", name) and (folder / name).is_file():
-                (folder / name).unlink()
-        (folder / _LIST).unlink()
+    def remove_old(self) -> None:
+        """Remove figures and tables of an earlier report, and nothing else: some may be of runs that are gone."""
+        for name in {*(self.folder / _LIST).read_text(encoding="utf-8").splitlines()} - {*self.names}:
+            if re.fullmatch(r"(figures|tables)/[^/]+", name) and (self.folder / name).is_file():
+                (self.folder / name).unlink()
+        (self.folder / _LIST).write_text("".join(f"{name}\n" for name in self.names), encoding="utf-8")

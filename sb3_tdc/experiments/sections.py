@@ -20,7 +20,14 @@ from sb3_tdc.experiments.published_curves import published_curves
 from sb3_tdc.experiments.report_files import Picture, ReportFiles
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import ISAAC, MUJOCO, PYBULLET
-from sb3_tdc.experiments.variants import compare_variants
+from sb3_tdc.experiments.variants import Comparison, compare_settings, compare_variants
+
+# How the last columns of two tables are made
+_COMPARED = (
+    "mean ± standard deviation over seeds of the evaluations in the last third of a run; the difference with Welch's "
+    "95 % interval; its p-value, corrected by Holm's method for the number of comparisons with several seeds on the "
+    "same task, of as many steps."
+)
 
 
 @dataclass
@@ -83,11 +90,11 @@ class Report:
             "Evaluations of the mean action, in bins of the paper's 20,000 steps, scaled with the length of the runs "
             "but never below the distance of evaluations. Thick: mean over seeds; band: 95 % interval of that mean "
             "(Student's t over seeds); thin: single seeds. One seed has no band. Unfinished runs are dotted and not "
-            "averaged. The band of two seeds is huge, and runs off the axis, which is made for the seeds. Dashed: SAC "
+            "averaged. The band of a few seeds can run off the axis, which is made for the seeds. Dashed: SAC "
             "as the repository of SimbaV2 has published it, with the interval of its seeds (MuJoCo before 3.5). "
-            "Algorithms are shown as hyperparams/ has them, where they have been run so. One figure for each task, "
-            "number of steps and MuJoCo (before or since 3.5). Where some were evaluated more often than others, a bin "
-            "averages more of their evaluations.",
+            "Algorithms are shown as hyperparams/ has them, where they have been run so; other settings have figures "
+            "below. One figure for each task, number of steps and MuJoCo (before or since 3.5). A bin is drawn at its "
+            "last step. Where some were evaluated more often than others, it averages more of their evaluations.",
         )
         for groups in self.conditions.values():
             if shown := headline(groups):
@@ -141,8 +148,9 @@ class Report:
         section = Section(
             "λ (Fig. 3)",
             "Groups that differ in λ alone: learning curves, and, of at least two fixed λ, the final return against λ, "
-            "every seed a dot, mean and 95 % t interval where there are several. A schedule has no place on "
-            "that axis. The paper's λ are 0, 0.25, 0.5, 0.75 and 1 on Humanoid and HalfCheetah. "
+            "every seed a dot, the mean a diamond with its 95 % t interval where there are several (that of a few "
+            "seeds can run off the axis). A schedule has no place on that axis. The paper's λ are 0, 0.25, 0.5, 0.75 "
+            "and 1 on Humanoid and HalfCheetah. "
             "Then variants of TDC next to the runs that they are compared with.",
         )
         import matplotlib
@@ -156,9 +164,8 @@ class Report:
             if len(numbers) > 1:
                 section.pictures.append(self.draw_sweep(f"lambda-sweep-{number}", numbers))
         for groups in self.conditions.values():
-            if shown := _variants_and_controls(groups):
-                labels = [group.label for group in shown]
-                section.pictures.append(self.draw_learning_curves("variants", shown, labels, figures.colors_of(labels)))
+            ablations = [one for one in compare_variants(groups) if one.variant.algo in ABLATIONS]
+            section.pictures += self.draw_comparisons(ablations)
         self.add_table(
             section,
             "lambda",
@@ -171,13 +178,33 @@ class Report:
         self.add_table(
             section,
             "variants",
-            tables.make_variants_table(self.groups),
-            "Variants of TDC, each against the control that differs in one thing: mean ± standard deviation over "
-            "seeds of the evaluations in the last third of a run; the difference with Welch's 95 % interval; its "
-            "p-value, corrected by Holm's method for the number of variants with several seeds on the same task, of as "
-            "many steps.",
+            tables.make_comparisons_table(compare_variants(self.groups)),
+            f"Variants of TDC, each against the control that differs in one thing: {_COMPARED}",
         )
         return section
+
+    def other_settings(self) -> Section:
+        section = Section(
+            "Other settings",
+            "Groups with other settings than those of hyperparams/, each next to the same algorithm as hyperparams/ "
+            "has it. λ and the head alone have sections of their own.",
+        )
+        compared = compare_settings(self.groups)
+        for groups in self.conditions.values():
+            section.pictures += self.draw_comparisons([one for one in compared if one.variant in groups])
+        caption = f"Each against the same algorithm as hyperparams/ has it: {_COMPARED}"
+        self.add_table(section, "settings", tables.make_comparisons_table(compared), caption)
+        return section
+
+    def draw_comparisons(self, compared: Sequence[Comparison]) -> list[Picture]:
+        """Draw the learning curves of each variant next to its control."""
+        pictures = []
+        for one in compared:
+            labels = [one.control.label, one.variant.label]
+            name = f"compared-{one.variant.label}"
+            shown = [one.control, one.variant]
+            pictures.append(self.draw_learning_curves(name, shown, labels, figures.colors_of(labels)))
+        return pictures
 
     def draw_sweep(self, name: str, groups: Sequence[Group]) -> Picture:
         """Draw final returns against λ, of groups that differ in a fixed λ alone."""
@@ -327,13 +354,6 @@ def read_all_test_returns(group: Group) -> np.ndarray:
     played = [returns for run in group.finished if (returns := read_test_returns(run)) is not None]
     fewest = min(map(len, played), default=0)
     return np.array([returns[:fewest] for returns in played]).reshape(len(played), fewest)
-
-
-def _variants_and_controls(groups: Sequence[Group]) -> list[Group]:
-    """Return, of groups under the same conditions, ablations and TDC as it is compared with them."""
-    compared = [c for c in compare_variants(groups) if c.variant.algo in ABLATIONS]
-    shown = [group for comparison in compared for group in (comparison.variant, comparison.control)]
-    return [group for group in groups if group in shown]
 
 
 def _about(conditions: Conditions) -> str:

@@ -17,7 +17,7 @@ from sb3_tdc.experiments.groups import Conditions, Group, by_conditions
 from sb3_tdc.experiments.published_curves import published_curves
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import MUJOCO
-from sb3_tdc.experiments.variants import compare_variants
+from sb3_tdc.experiments.variants import Comparison
 
 TASKS = ("HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid")
 _PUBLISHED = Path(__file__).with_name("published.yml")
@@ -235,8 +235,8 @@ def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """Make one row for each variant of TDC that is there next to its control."""
+def make_comparisons_table(comparisons: Sequence[Comparison]) -> pd.DataFrame:
+    """Make one row for each variant next to its control."""
     return pd.DataFrame(
         [
             {
@@ -248,7 +248,7 @@ def make_variants_table(groups: Sequence[Group]) -> pd.DataFrame:
                 "p": "–" if np.isnan(comparison.p) else f"{comparison.p:.2g}",
                 "Verdict": comparison.verdict,
             }
-            for comparison in compare_variants(groups)
+            for comparison in comparisons
         ]
     )
 

@@ -42,4 +42,6 @@ def _check(evaluations: Evaluations, path: Path) -> None:
     are_numbers = all(np.issubdtype(values.dtype, np.number) for values in (timesteps, returns))
     if not are_numbers or returns.ndim != 2 or not returns.size or timesteps.shape != returns.shape[:1]:
         found = f"{timesteps.dtype} {timesteps.shape} and {returns.dtype} {returns.shape}"
-        raise ValueError(f"{path} must have one step and at least one return for each evaluation, got arrays of {found}")
+        raise ValueError(
+            f"{path} must have one step and at least one return for each evaluation, got arrays of {found}"
+        )

@@ -358,6 +358,22 @@ def test_an_earlier_report_leaves_nothing(tmp_path):
     assert not (out / "tables" / "lambda.csv").exists()
 
 
+def test_a_report_that_fails_leaves_the_earlier_one_and_the_next_removes_what_it_wrote(tmp_path, monkeypatch):
+    make_run(tmp_path / "one", lam=0.0, log={"train/td_error_var": [1.0]})
+    make_run(tmp_path / "other", algo="td3")
+    out = tmp_path / "out"
+    page = report.write_report(*find_runs(tmp_path / "one"), out)
+    before = page.read_text(), {path for path in out.rglob("*") if path.is_file()}
+    with monkeypatch.context() as failing:
+        failing.setattr(report.Report, "claims", lambda self: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            report.write_report(*find_runs(tmp_path / "other"), out)
+    assert page.read_text() == before[0]
+    assert all(path.is_file() for path in before[1])
+    report.write_report(*find_runs(tmp_path / "one"), out)
+    assert {path for path in out.rglob("*") if path.is_file()} == before[1]
+
+
 def test_seeds_of_several_commits_are_said(tmp_path):
     for seed, commit in ((1, "a" * 40), (2, f"{'b' * 40}, with uncommitted changes")):
         run = make_run(tmp_path, seed=seed)

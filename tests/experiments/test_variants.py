@@ -81,7 +81,7 @@ def test_the_difference_of_late_evaluations(tmp_path):
     assert found.difference == pytest.approx((90, 90 - half, 90 + half))
     assert found.p == pytest.approx(2 * stats.t.sf(90 / np.sqrt(200 / 3), 4))
     assert found.verdict == "better"
-    row = tables.make_variants_table(group_runs(find_runs(tmp_path)[0])).to_dict("records")[0]
+    row = tables.make_comparisons_table(compare_variants(group_runs(find_runs(tmp_path)[0]))).to_dict("records")[0]
     assert row["Variant"] == "TDC, λ 0.5: 100 ± 10 (3 seeds)"
     assert row["Difference"] == f"90 [{90 - half:.1f}, {90 + half:.0f}]"
 
@@ -123,7 +123,7 @@ def test_ablations_are_drawn_next_to_their_control(tmp_path):
     groups = group_runs(find_runs(tmp_path / "logs")[0])
     report = sections.Report(groups, tmp_path / "report")
     (picture,) = report.lambda_sweep().pictures
-    assert picture.name == f"variants-{groups[0].conditions.file_name}"
+    assert picture.name == f"compared-TDC-SHIFT-{groups[0].conditions.file_name}"
     assert "TDC: 2 (1, 2); TDC-SHIFT: 1 (1)." in picture.caption
     (picture,) = report.learning_curves().pictures
     assert "TDC: 2 (1, 2); SAC: 1 (1)." in picture.caption
@@ -142,7 +142,7 @@ def test_runs_without_late_evaluations_are_not_said_to_be_too_few(tmp_path):
         run = make_run(tmp_path, seed=seed, lam=0.5, returns=((3.0,), (4.0,)))
         np.savez(run.path / "evaluations.npz", timesteps=[300, 600], results=[[3.0], [4.0]])  # of 1,000 steps
     make_runs(tmp_path, [(1.0, 1.0), (3.0, 3.0)], lam=0.0)
-    (row,) = tables.make_variants_table(group_runs(find_runs(tmp_path)[0])).to_dict("records")
+    (row,) = tables.make_comparisons_table(compare_variants(group_runs(find_runs(tmp_path)[0]))).to_dict("records")
     assert row["Variant"] == "TDC, λ 0.5: – (0 seeds)"
     assert row["Control"].endswith("2 ± 1.4 (2 seeds)")
     assert (row["Difference"], row["p"]) == ("–", "–")
@@ -192,6 +192,19 @@ def test_other_settings_are_compared_with_those_of_the_file(tmp_path):
         ("TDC, λ 0, kappa 10", "TDC"),
         ("TD3, learning_starts 25,000", "TD3, learning_starts 100"),
     }
+
+
+def test_other_settings_are_in_the_report(tmp_path):
+    pytest.importorskip("matplotlib")
+    make_runs(tmp_path / "logs", [(1.0, 2.0), (2.0, 3.0)])
+    make_runs(tmp_path / "logs", [(5.0, 6.0)], kappa=10.0)
+    groups = group_runs(find_runs(tmp_path / "logs")[0])
+    report = sections.Report(groups, tmp_path / "report")
+    section = report.other_settings()
+    (picture,), ((_, table),) = section.pictures, section.tables
+    assert "TDC: 2 (1, 2); TDC, kappa 10: 1 (1)." in picture.caption
+    assert table["Variant"].tolist() == ["TDC, kappa 10: 5.5 (1 seed)"]
+    assert report.lambda_sweep().tables == []
 
 
 def test_other_settings_by_scipy(tmp_path):
