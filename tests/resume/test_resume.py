@@ -125,6 +125,12 @@ def test_a_run_that_is_made_longer_is_the_run_of_that_length(tmp_path, flags, st
     assert capsys.readouterr().out == f"{folder} is finished: there is nothing to resume\n"
 
 
+def test_a_run_is_made_shorter(stopped):
+    assert resume(stopped, "-n", "300") == 0
+    run = RunFolder.open(stopped)
+    assert (run.steps_at_end, run.config["n_timesteps"]) == (300, 300)
+
+
 def test_schedules_follow_the_new_length(stopped, capsys):
     config = stopped / "Hopper-v4" / "config.yml"
     config.write_text(plain_yaml.dump({**RunFolder.open(stopped).config, "n_timesteps": 300}))
