@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tdc import TDC
 from sb3_tdc.hyperparams import hyperparams_file, parse, read_entry
-from sb3_tdc.resume import DEFAULT_FREQ, ResumeStates
+from sb3_tdc.resume import DEFAULT_FREQ, ResumeCallback
 
 ENVIRONMENTS = ("HalfCheetah-v4", "Humanoid-v4")
 WARM_UP, TIMED = 300, 2_000
@@ -31,7 +31,7 @@ class Clock(BaseCallback):
 
     is_captured = False
 
-    def __init__(self, states: ResumeStates):
+    def __init__(self, states: ResumeCallback):
         super().__init__()
         self.states = states
         self.per_step = 0.0
@@ -63,7 +63,7 @@ def measure(env_id: str, n_states: int, freq: int, folder: Path) -> dict[str, fl
     """
     entry, _ = read_entry(hyperparams_file("tdc"), env_id)
     model = TDC(env=gym.make(env_id), seed=1, device="cpu", **{**_model_arguments(entry), "learning_starts": WARM_UP})
-    states = ResumeStates(folder / "resume", freq, verbose=0)
+    states = ResumeCallback(folder / "resume", freq, verbose=0)
     clock = Clock(states)
     model.learn(n_states * freq + 10, callback=[states, clock])
     segments = [path.stat().st_size for path in sorted((folder / "resume" / "replay").iterdir())]

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC
     from sb3_tdc.common.finite import NonFiniteError
     from sb3_tdc.meow import MEOW
-    from sb3_tdc.resume import ResumeStates
+    from sb3_tdc.resume import ResumeCallback
     from sb3_tdc.safe_load import UnsafeFileError, load_safely
     from sb3_tdc.tdc import TDC
 
@@ -20,7 +20,7 @@ _MODULES = {
     "AdvBTD3": "advb",
     "AdvBTDC": "advb",
     "NonFiniteError": "common.finite",
-    "ResumeStates": "resume",
+    "ResumeCallback": "resume",
     "UnsafeFileError": "safe_load",
     "load_safely": "safe_load",
 }
@@ -33,7 +33,7 @@ __all__ = [
     "AdvBTD3",
     "AdvBTDC",
     "NonFiniteError",
-    "ResumeStates",
+    "ResumeCallback",
     "UnsafeFileError",
     "__version__",
     "load_safely",

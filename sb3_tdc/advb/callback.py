@@ -16,24 +16,24 @@ class BoardCallback(BaseCallback):
 
     Test episodes cost steps that ``num_timesteps`` does not count: they are logged as ``board/test_steps``.
 
-    :param test_env: one separate environment, wrapped like that of the training; if it normalises, it is given the
+    :param eval_env: one separate environment, wrapped like that of the training; if it normalises, it is given the
         training's statistics and leaves rewards as they are
     :param verbose: 1 prints every new member
     :raises ValueError: when training begins, if only one of the two is wrapped in ``VecNormalize``
     """
 
-    def __init__(self, test_env: VecEnv, verbose: int = 0):
+    def __init__(self, eval_env: VecEnv, verbose: int = 0):
         super().__init__(verbose)
-        if test_env.num_envs != 1:
-            raise ValueError(f"test_env must be one environment, got {test_env.num_envs}")
-        self.test_env = test_env
+        if eval_env.num_envs != 1:
+            raise ValueError(f"eval_env must be one environment, got {eval_env.num_envs}")
+        self.eval_env = eval_env
         self.test_steps = 0
 
     def _init_callback(self) -> None:
-        training, self._normalization = self.model.get_vec_normalize_env(), unwrap_vec_normalize(self.test_env)
+        training, self._normalization = self.model.get_vec_normalize_env(), unwrap_vec_normalize(self.eval_env)
         if (training is None) != (self._normalization is None):
-            where = "test_env" if training is None else "the training's environment"
-            raise ValueError(f"test_env must be wrapped as the training's environment, but only {where} is normalised")
+            where = "eval_env" if training is None else "the training's environment"
+            raise ValueError(f"eval_env must be wrapped as the training's environment, but only {where} is normalised")
         if self._normalization is not None:
             self._normalization.training = self._normalization.norm_reward = False
 
@@ -48,7 +48,7 @@ class BoardCallback(BaseCallback):
         self._synchronize_normalization()
         with policy.actor_alone():
             returns, lengths = evaluate_policy(
-                self.model, self.test_env, n_eval_episodes=1, return_episode_rewards=True, warn=False
+                self.model, self.eval_env, n_eval_episodes=1, return_episode_rewards=True, warn=False
             )
         assert isinstance(returns, list) and isinstance(lengths, list)  # noqa: PT018
         self.test_steps += lengths[0]

@@ -1,6 +1,6 @@
 """Exact, crash-safe continuation of runs of SB3's off-policy algorithms (docs/resume.md)."""
 
-from sb3_tdc.resume.callback import DEFAULT_FREQ, ResumeStates
+from sb3_tdc.resume.callback import DEFAULT_FREQ, ResumeCallback
 from sb3_tdc.resume.restorable import Restorable
 from sb3_tdc.resume.store import BrokenStateError, LockedError, stored_steps
 from sb3_tdc.resume.walk import NotCapturedError, NotRestoredError
@@ -12,6 +12,6 @@ __all__ = [
     "NotCapturedError",
     "NotRestoredError",
     "Restorable",
-    "ResumeStates",
+    "ResumeCallback",
     "stored_steps",
 ]

@@ -34,11 +34,11 @@ _ENVIRONMENT = re.compile(r".*?, environment \d+(?=: )")
 _OLDER = 10
 
 
-class ResumeStates(BaseCallback):
+class ResumeCallback(BaseCallback):
     """
     Write states from which a run continues as if it had never been stopped. Must be the first callback::
 
-        states = ResumeStates("my_run/resume")
+        states = ResumeCallback("my_run/resume")
         states.select(model)  # nothing happens if there are none yet
         model.learn(1_000_000, callback=[states, ...])
 

@@ -307,5 +307,5 @@ def _sync_folder(path: Path) -> None:
 def _lock(path: Path) -> Any:
     file = lock(path)
     if file is None:
-        raise LockedError(f"Another process, or a newer ResumeStates in this process, writes to {path.parent}")
+        raise LockedError(f"Another process, or a newer ResumeCallback in this process, writes to {path.parent}")
     return file

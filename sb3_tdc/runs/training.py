@@ -36,14 +36,14 @@ from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.processes import closing_envs, ended_processes
 from sb3_tdc.envs.registry import simulator_of
 from sb3_tdc.hyperparams import Hyperparams
-from sb3_tdc.resume import DEFAULT_FREQ, LockedError, NotRestoredError, ResumeStates, stored_steps
-from sb3_tdc.runs.callbacks.busy_machine import BusyMachine
-from sb3_tdc.runs.callbacks.critic_evaluation import CriticEvaluation
-from sb3_tdc.runs.callbacks.finite_guard import FiniteGuard, divergence_named
-from sb3_tdc.runs.callbacks.hparams import RecordHyperparams
+from sb3_tdc.resume import DEFAULT_FREQ, LockedError, NotRestoredError, ResumeCallback, stored_steps
+from sb3_tdc.runs.callbacks.busy_machine import BusyMachineCallback
+from sb3_tdc.runs.callbacks.critic_evaluation import CriticEvaluationCallback
+from sb3_tdc.runs.callbacks.finite_guard import FiniteGuardCallback, divergence_named
+from sb3_tdc.runs.callbacks.hparams import RecordHyperparamsCallback
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
-from sb3_tdc.runs.callbacks.saving import SaveBest, SavePeriodically
-from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+from sb3_tdc.runs.callbacks.saving import SaveBestCallback, SavePeriodicallyCallback
+from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import DISK_ERRORS, check_saved_by, continue_model, load_experience, make_model, save_model
 from sb3_tdc.runs.settings import RunSettings
@@ -139,7 +139,7 @@ def train(run: TrainingRun) -> TrainingOutcome:
             if states is not None:
                 stack.callback(states.store.close)
             model = _make_model(run, stack.enter_context(closing_envs(_make_training_envs(run))))
-            stop = StopOnSignal(states)
+            stop = StopOnSignalCallback(states)
             callbacks = _make_callbacks(run, model, stop, states, stack)
             if states is not None:
                 _select_state(run, states, model)
@@ -239,12 +239,12 @@ def _save(run: TrainingRun, model: OffPolicyAlgorithm) -> None:
 # ---------------------------------------------------------------- resume states
 
 
-def _open_states(run: TrainingRun) -> ResumeStates | None:
+def _open_states(run: TrainingRun) -> ResumeCallback | None:
     folder, settings = run.folder, run.settings
     if not settings.writes_states:
         return None
     of_evaluations = [folder.best_model, folder.normalization(folder.best_model)]
-    states = ResumeStates(
+    states = ResumeCallback(
         folder.resume_folder,
         run.resume_freq,
         files=of_evaluations if settings.eval_freq > 0 else [],
@@ -260,7 +260,7 @@ def _open_states(run: TrainingRun) -> ResumeStates | None:
     return states
 
 
-def _select_state(run: TrainingRun, states: ResumeStates, model: OffPolicyAlgorithm) -> None:
+def _select_state(run: TrainingRun, states: ResumeCallback, model: OffPolicyAlgorithm) -> None:
     """
     Select the state to resume from, and record hyperparameters that are others from there on.
 
@@ -346,15 +346,19 @@ def _make_logger(run: TrainingRun) -> Logger:
 
 
 def _make_callbacks(
-    run: TrainingRun, model: OffPolicyAlgorithm, stop: StopOnSignal, states: ResumeStates | None, stack: ExitStack
+    run: TrainingRun,
+    model: OffPolicyAlgorithm,
+    stop: StopOnSignalCallback,
+    states: ResumeCallback | None,
+    stack: ExitStack,
 ) -> list[BaseCallback]:
     """Make all callbacks, in the order in which they are called: a state is written before anything else happens."""
     settings, hyperparams = run.settings, run.hyperparams
     progress = ProgressCallback(bool(settings.progress), settings.verbose)
     stack.callback(progress.close)
-    callbacks: list[BaseCallback] = [BusyMachine(progress.say, _remedy(run))]
+    callbacks: list[BaseCallback] = [BusyMachineCallback(progress.say, _remedy(run))]
     if not isinstance(model, CheckedOffPolicyAlgorithm):
-        callbacks.append(FiniteGuard())
+        callbacks.append(FiniteGuardCallback())
     if states is not None:
         callbacks.append(states)
     can_evaluate = simulator_of(settings.env).make_vec is None
@@ -364,7 +368,7 @@ def _make_callbacks(
         callbacks.append(BoardCallback(_make_other_envs(run, model, stack, _BOARD_SEED, 1, settings.env_kwargs)))
     callbacks += [make() for make in hyperparams.callbacks]
     identity = {"algo": settings.algo, "env": settings.env, "seed": settings.seed}
-    callbacks.append(RecordHyperparams(identity | hyperparams.raw))
+    callbacks.append(RecordHyperparamsCallback(identity | hyperparams.raw))
     callbacks += _make_saving(run)
     if can_evaluate:
         callbacks += _make_evaluation(run, model, progress, stop, stack)
@@ -381,21 +385,25 @@ def _make_saving(run: TrainingRun) -> list[BaseCallback]:
         return []
     with_buffer = settings.save_replay_buffer
     freq = _calls(run, settings.save_freq)
-    return [SavePeriodically(freq, str(folder), save_replay_buffer=with_buffer, save_vecnormalize=True)]
+    return [SavePeriodicallyCallback(freq, str(folder), save_replay_buffer=with_buffer, save_vecnormalize=True)]
 
 
 def _make_evaluation(
-    run: TrainingRun, model: OffPolicyAlgorithm, progress: ProgressCallback, stop: StopOnSignal, stack: ExitStack
+    run: TrainingRun,
+    model: OffPolicyAlgorithm,
+    progress: ProgressCallback,
+    stop: StopOnSignalCallback,
+    stack: ExitStack,
 ) -> list[BaseCallback]:
     settings = run.settings
     if settings.eval_freq <= 0:
         return []
     env_kwargs = settings.eval_env_kwargs or settings.env_kwargs
     return [
-        CriticEvaluation(
+        CriticEvaluationCallback(
             _make_other_envs(run, model, stack, _EVALUATION_SEED, settings.n_eval_envs, env_kwargs),
             stop,
-            callback_on_new_best=SaveBest(run.folder),
+            callback_on_new_best=SaveBestCallback(run.folder),
             callback_after_eval=progress.evaluation,
             n_eval_episodes=settings.eval_episodes,
             eval_freq=_calls(run, settings.eval_freq),

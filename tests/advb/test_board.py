@@ -182,8 +182,8 @@ class Watch(BaseCallback):
 @pytest.mark.parametrize("formation_period", [2, 10_000])
 def test_the_board_acts_in_training_from_the_formation_period_on(monkeypatch, algorithm, formation_period):
     model = make(algorithm, formation_period=formation_period)
-    watch, test_env = Watch(monkeypatch), make_vec_env(TwoActions, 1)
-    model.learn(40, callback=[BoardCallback(test_env), watch])
+    watch, eval_env = Watch(monkeypatch), make_vec_env(TwoActions, 1)
+    model.learn(40, callback=[BoardCallback(eval_env), watch])
     assert len(watch.asked) >= 6
     assert watch.asked == [i >= formation_period for i in range(len(watch.asked))]
 
@@ -196,7 +196,7 @@ def test_every_training_episode_is_followed_by_a_test_episode_of_the_actor_alone
     assert model._episode_num > 10
     assert len(model.policy.board) == model._episode_num
     assert 5 * model._episode_num <= callback.test_steps <= 7 * model._episode_num  # episodes are 5 or 7 steps long
-    assert callback.test_env.envs[0].unwrapped.episode >= model._episode_num
+    assert callback.eval_env.envs[0].unwrapped.episode >= model._episode_num
     log = model.logger.name_to_value
     assert (log["board/test_steps"], log["board/members"]) == (callback.test_steps, model._episode_num)
     assert log["board/best_return"] == model.policy.board.returns[: len(model.policy.board)].max()
@@ -204,10 +204,10 @@ def test_every_training_episode_is_followed_by_a_test_episode_of_the_actor_alone
 
 def test_test_episodes_use_the_statistics_of_the_training():
     env = VecNormalize(make_vec_env(TwoActions, 1, seed=1))
-    test_env = VecNormalize(make_vec_env(TwoActions, 1, seed=2), training=False, norm_reward=False)
+    eval_env = VecNormalize(make_vec_env(TwoActions, 1, seed=2), training=False, norm_reward=False)
     model = make(env=env)
-    model.learn(40, callback=BoardCallback(test_env))
-    assert test_env.obs_rms.count > 20  # its own stays at 10⁻⁴
+    model.learn(40, callback=BoardCallback(eval_env))
+    assert eval_env.obs_rms.count > 20  # its own stays at 10⁻⁴
     with pytest.raises(ValueError, match="one environment, got 2"):
         BoardCallback(make_vec_env(TwoActions, 2))
 
@@ -215,9 +215,9 @@ def test_test_episodes_use_the_statistics_of_the_training():
 @ALGORITHMS
 def test_test_episodes_may_be_monitored_outside_the_normalisation(algorithm):
     """Returns are then numbers of NumPy, and the statistics lie deeper."""
-    env, test_env = (VecMonitor(VecNormalize(make_vec_env(TwoActions, 1, seed=seed))) for seed in (1, 2))
-    make(algorithm, env=env).learn(40, callback=BoardCallback(test_env))
-    assert env.obs_rms.count - 7 <= test_env.obs_rms.count <= env.obs_rms.count  # since the last episode has ended
+    env, eval_env = (VecMonitor(VecNormalize(make_vec_env(TwoActions, 1, seed=seed))) for seed in (1, 2))
+    make(algorithm, env=env).learn(40, callback=BoardCallback(eval_env))
+    assert env.obs_rms.count - 7 <= eval_env.obs_rms.count <= env.obs_rms.count  # since the last episode has ended
 
 
 def test_returns_of_test_episodes_are_not_normalised():
@@ -226,20 +226,20 @@ def test_returns_of_test_episodes_are_not_normalised():
             observation, _, *rest = super().step(action)
             return observation, -1.0, *rest
 
-    env, test_env = (VecNormalize(DummyVecEnv([Constant])) for _ in range(2))  # no Monitor, which would know them
+    env, eval_env = (VecNormalize(DummyVecEnv([Constant])) for _ in range(2))  # no Monitor, which would know them
     model = make(env=env, n_members=20)
-    model.learn(40, callback=BoardCallback(test_env))
+    model.learn(40, callback=BoardCallback(eval_env))
     returns = model.policy.board.returns[: len(model.policy.board)].tolist()
     assert set(returns) == {-5.0}  # every second episode has 5 steps, and every test resets twice
-    assert test_env.obs_rms.count == pytest.approx(env.obs_rms.count, abs=10)  # its own steps are not in it
+    assert eval_env.obs_rms.count == pytest.approx(env.obs_rms.count, abs=10)  # its own steps are not in it
 
 
-@pytest.mark.parametrize("normalised", ["env", "test_env"])
+@pytest.mark.parametrize("normalised", ["env", "eval_env"])
 def test_one_normalised_environment_alone_is_refused(normalised):
-    envs = {name: make_vec_env(TwoActions, 1) for name in ("env", "test_env")}
+    envs = {name: make_vec_env(TwoActions, 1) for name in ("env", "eval_env")}
     envs[normalised] = VecNormalize(envs[normalised])
-    with pytest.raises(ValueError, match="test_env must be wrapped as the training's environment, but only"):
-        make(env=envs["env"]).learn(10, callback=BoardCallback(envs["test_env"]))
+    with pytest.raises(ValueError, match="eval_env must be wrapped as the training's environment, but only"):
+        make(env=envs["env"]).learn(10, callback=BoardCallback(envs["eval_env"]))
 
 
 @ALGORITHMS
@@ -267,13 +267,13 @@ def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
     names = [name for name in advised.policy.state_dict() if not name.startswith(("board.", "lam"))]
     plain.policy.load_state_dict({name: advised.policy.state_dict()[name] for name in names})
     before = {name: advised.policy.state_dict()[name].clone() for name in names}
-    results, test_env = [], make_vec_env(TwoActions, 1, seed=1)
+    results, eval_env = [], make_vec_env(TwoActions, 1, seed=1)
     for model in (advised, plain):
         th.manual_seed(0)
         np.random.seed(0)
         model.action_space.seed(0)
         model.env.seed(0)
-        callback = BoardCallback(test_env) if model is advised else None
+        callback = BoardCallback(eval_env) if model is advised else None
         model.learn(40, callback=callback)
         results.append(model.policy.state_dict())
     assert len(advised.policy.board) > 0

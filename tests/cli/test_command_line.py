@@ -22,7 +22,7 @@ from sb3_tdc import TDC
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.threads import set_threads
-from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization
 from tests.helpers.command_line import SMALL, SMALL_ANY, run_enjoy, run_train
@@ -195,7 +195,7 @@ def stop_at_150(self):
 
 
 def test_the_command_to_go_on_is_the_same_experiment(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(StopOnSignal, "_on_step", stop_at_150)
+    monkeypatch.setattr(StopOnSignalCallback, "_on_step", stop_at_150)
     params = [*SMALL, "lam:0.25", "normalize:true"]
     assert run_train(tmp_path, "--resume-freq", -1, small=params) == 130
     (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  sb3-tdc train")]
@@ -262,7 +262,7 @@ def test_the_command_to_watch_consents_to_classes_of_the_user_s_own(tmp_path, ow
 
 def test_the_command_to_go_on_consents_to_classes_of_the_user_s_own(tmp_path, own_parts, capsys, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(StopOnSignal, "_on_step", stop_at_150)
+        patch.setattr(StopOnSignalCallback, "_on_step", stop_at_150)
         assert run_train(tmp_path, "--resume-freq", -1, env="Pendulum-v1", small=own_parts) == 130
     (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  sb3-tdc train")]
     assert train.main(shlex.split(command)[2:]) == 0
@@ -410,7 +410,7 @@ main("--env Endless-v0 -n 1000 --eval-freq 150 -params learning_starts:990 -f {t
 
 def test_a_signal_stops_after_the_step_and_handlers_are_put_back():
     before = signal.getsignal(signal.SIGINT)
-    with StopOnSignal() as stop:
+    with StopOnSignalCallback() as stop:
         assert stop._on_step()
         os.kill(os.getpid(), signal.SIGINT)
         assert not stop._on_step()

@@ -18,7 +18,7 @@ from sb3_tdc.common.plots import import_figure
 from sb3_tdc.critics import episodes as explain
 from sb3_tdc.critics import figures, returns
 from sb3_tdc.runs.callbacks import critic_evaluation
-from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback
 from sb3_tdc.tdc.quantiles import select_critic
 
 REWARDS = st.lists(st.floats(-100, 100), min_size=1, max_size=30)
@@ -307,8 +307,8 @@ def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monke
     eval_env.training = eval_env.norm_reward = False
     model = make_model(env, gradient_steps=0)
     model._n_updates = 1
-    model.learn(30, callback=critic_evaluation.CriticEvaluation(
-        eval_env, StopOnSignal(), n_eval_episodes=2, eval_freq=30, verbose=0, warn=False
+    model.learn(30, callback=critic_evaluation.CriticEvaluationCallback(
+        eval_env, StopOnSignalCallback(), n_eval_episodes=2, eval_freq=30, verbose=0, warn=False
     ))  # fmt: skip
     (episodes,) = seen
     assert len(episodes) == 2

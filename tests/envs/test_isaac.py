@@ -11,7 +11,7 @@ from sb3_tdc import TDC
 from sb3_tdc.cli.train import main
 from sb3_tdc.envs import isaac
 from sb3_tdc.envs.registry import require_env
-from sb3_tdc.resume import ResumeStates
+from sb3_tdc.resume import ResumeCallback
 from tests.helpers.isaac import INTERFACES, LIMIT, TASK, install
 
 N_ENVS = 6
@@ -122,7 +122,7 @@ def test_a_resumed_run_begins_new_episodes(monkeypatch, tmp_path):
     def learn(n):
         envs = isaac.make_vec(TASK, N_ENVS, seed=1, env_kwargs={"device": "cpu"})
         model = TDC("MlpPolicy", envs, learning_starts=12, buffer_size=600, seed=0)
-        states = ResumeStates(tmp_path, freq=2 * N_ENVS)
+        states = ResumeCallback(tmp_path, freq=2 * N_ENVS)
         states.select(model)
         model.learn(n, callback=states)
         states.store.close()

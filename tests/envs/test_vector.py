@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from sb3_tdc import TDC, ResumeStates
+from sb3_tdc import TDC, ResumeCallback
 from sb3_tdc.cli import enjoy, train
 from sb3_tdc.envs.vector import GymnasiumVecEnv, split_infos
 from sb3_tdc.hyperparams import parse
@@ -349,8 +349,8 @@ def test_a_training_with_it_resumes_exactly(tmp_path, monkeypatch):
             raise Killed
         own(self, step)
 
-    own = ResumeStates._write
-    monkeypatch.setattr(ResumeStates, "_write", die_at_300)
+    own = ResumeCallback._write
+    monkeypatch.setattr(ResumeCallback, "_write", die_at_300)
     with pytest.raises(Killed):
         train_on(tmp_path / "stopped")
     monkeypatch.undo()
@@ -375,7 +375,7 @@ class Locked(Tensors):
 
 def test_environments_that_cannot_be_captured_begin_new_episodes(tmp_path):
     def learn(steps):
-        states = ResumeStates(tmp_path / "resume", freq=20)
+        states = ResumeCallback(tmp_path / "resume", freq=20)
         model = TDC("MlpPolicy", GymnasiumVecEnv(Locked()), learning_starts=1000, buffer_size=400, seed=0, device="cpu")
         states.select(model)
         with pytest.warns(RuntimeWarning, match="lock") as caught:

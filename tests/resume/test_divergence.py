@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tdc import TDC, NonFiniteError
 from sb3_tdc.cli import train
-from sb3_tdc.resume import ResumeStates, stored_steps
+from sb3_tdc.resume import ResumeCallback, stored_steps
 from tests.tools.runs import Stop, StopAt
 
 
@@ -178,7 +178,7 @@ def test_no_state_is_written_of_what_is_not_finite(tmp_path, poison, named):
     algorithm = TD3 if poison is weight else SAC
     model = make_model(algorithm, VecNormalize(DummyVecEnv([lambda: Breaks("nothing")])), learning_starts=65)
     model.train = _no_updates_after(model, 78)
-    states = ResumeStates(tmp_path, freq=20, verbose=0)
+    states = ResumeCallback(tmp_path, freq=20, verbose=0)
     with pytest.raises(NonFiniteError, match=rf"state of step 80 was not written: .*{named}.* not finite"):
         model.learn(200, callback=[states, Poison(poison)])
     assert states.store.steps() == [60, 40, 20, 0]
@@ -234,20 +234,20 @@ def _finite_step(self, action):
 def _stop_at(monkeypatch, step):
     """As sudden as a kill."""
     stop = [step]
-    on_step = ResumeStates._on_step
+    on_step = ResumeCallback._on_step
 
     def on_step_or_stop(self):
         if self.num_timesteps >= stop[0]:
             raise Stop
         return on_step(self)
 
-    monkeypatch.setattr(ResumeStates, "_on_step", on_step_or_stop)
+    monkeypatch.setattr(ResumeCallback, "_on_step", on_step_or_stop)
     return stop
 
 
 def test_a_schedule_may_be_changed_too(tmp_path):
     def learn(model, step=None, changed=(), stop_at=None):
-        states = ResumeStates(tmp_path, freq=20, verbose=0)
+        states = ResumeCallback(tmp_path, freq=20, verbose=0)
         try:
             states.select(model, step, changed)
             model.learn(120, callback=[states, StopAt(stop_at)])

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
-from sb3_tdc.resume import ResumeStates
+from sb3_tdc.resume import ResumeCallback
 from sb3_tdc.resume.locations import Locations
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
 from tests.helpers.training import outcome, resume, run_train
@@ -159,7 +159,7 @@ def learn(folder, outside, stop_at=None):
     env = make_vec_env("Pendulum-v1", seed=1)
     small = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 200, "learning_starts": 500, "device": "cpu"}
     model = SAC("MlpPolicy", env, seed=1, **small)
-    states = ResumeStates(folder / "resume", freq=20, verbose=0)
+    states = ResumeCallback(folder / "resume", freq=20, verbose=0)
     inside, notes = Notes(folder), Notes(outside)
     evaluation = EvalCallback(make_vec_env("Pendulum-v1"), eval_freq=30, log_path=str(outside / "eval"), verbose=0)
     saving = CheckpointCallback(25, str(outside / "models"))
@@ -268,7 +268,7 @@ def learn_with_columns(folder, stop_at=None):
     small = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 200, "learning_starts": 5, "batch_size": 4}
     model = SAC("MlpPolicy", gym.make("Pendulum-v1", max_episode_steps=20), seed=1, device="cpu", **small)
     model.set_logger(configure(str(folder), ["csv"]))
-    states, means = ResumeStates(folder / "resume", freq=20, verbose=0), Means(folder)
+    states, means = ResumeCallback(folder / "resume", freq=20, verbose=0), Means(folder)
     states.select(model)
     try:
         model.learn(90, callback=[states, means, StopAt(stop_at)], log_interval=1)

@@ -1,4 +1,4 @@
-"""``train.py --resume`` and ``ResumeStates``: what a user sees when a run is stopped, damaged, or not what it was."""
+"""``train.py --resume`` and ``ResumeCallback``: what a user sees when a run is stopped, damaged, or not what it was."""
 
 import errno
 import functools
@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_tdc import TDC
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.resume import LockedError, Restorable, ResumeStates, callback, stored_steps
+from sb3_tdc.resume import LockedError, Restorable, ResumeCallback, callback, stored_steps
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.runs import training
 from sb3_tdc.runs.callbacks import busy_machine
@@ -184,7 +184,7 @@ def test_starting_over_removes_states_that_are_there(stopped, whole, capsys):
 
 def test_a_run_that_was_stopped_before_its_first_step_begins_again(tmp_path, whole, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(ResumeStates, "_write", lambda *args: os.kill(os.getpid(), signal.SIGKILL))
+        patch.setattr(ResumeCallback, "_write", lambda *args: os.kill(os.getpid(), signal.SIGKILL))
         if (child := os.fork()) == 0:
             run_train(tmp_path)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
@@ -233,7 +233,7 @@ def test_the_same_arguments_are_no_contradiction(stopped, whole):
 def test_a_full_disk_stops_nothing_but_the_state(tmp_path, whole, monkeypatch, stop_at):
     """From step 100 to 250 nothing can be synced: no state is written, and the one before stays."""
     folder = tmp_path / "tdc" / "Hopper-v4_1"
-    write = ResumeStates._write
+    write = ResumeCallback._write
 
     def full(self, step):
         with monkeypatch.context() as patch:
@@ -245,7 +245,7 @@ def test_a_full_disk_stops_nothing_but_the_state(tmp_path, whole, monkeypatch, s
         assert list((folder / "resume").glob("step_*"))
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(ResumeStates, "_write", full)
+    monkeypatch.setattr(ResumeCallback, "_write", full)
     stop_at(300)
     with pytest.warns(
         RuntimeWarning, match=r"could not be written .*No space left.* Training continues; that of step 80"
@@ -292,7 +292,7 @@ def make_model(env="Pendulum-v1", algorithm=TDC, seed=1, **kwargs):
 
 
 def learn(model, folder, stop_at=None, steps=150, **kwargs):
-    states = ResumeStates(folder, freq=20, verbose=0, **kwargs)
+    states = ResumeCallback(folder, freq=20, verbose=0, **kwargs)
     try:
         restored = states.select(model)
         model.learn(steps, callback=[states, StopAt(stop_at)])
@@ -314,7 +314,7 @@ def test_a_state_of_another_run_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=re.escape(difference)):
             learn(model, tmp_path)
-    model, states = make_model(), ResumeStates(tmp_path)
+    model, states = make_model(), ResumeCallback(tmp_path)
     with pytest.raises(ValueError, match="has states of a run already: call select"):
         model.learn(10, callback=states)
     states.store.close()
@@ -324,9 +324,9 @@ def test_an_older_callback_removes_nothing_of_a_newer_one(tmp_path):
     learn(make_model(), tmp_path, stop_at=70)
     steps = stored_steps(tmp_path)
     assert len(steps) > 1
-    model, older = make_model(), ResumeStates(tmp_path, verbose=0)
+    model, older = make_model(), ResumeCallback(tmp_path, verbose=0)
     older.select(model, step=steps[-1])
-    newer = ResumeStates(tmp_path, verbose=0)
+    newer = ResumeCallback(tmp_path, verbose=0)
     with pytest.raises(LockedError):
         model.learn(150, callback=older)
     assert stored_steps(tmp_path) == steps
@@ -335,7 +335,7 @@ def test_an_older_callback_removes_nothing_of_a_newer_one(tmp_path):
 
 def test_other_callbacks_are_noticed(tmp_path):
     learn(make_model(), tmp_path, stop_at=70)
-    model, states = make_model(), ResumeStates(tmp_path)
+    model, states = make_model(), ResumeCallback(tmp_path)
     states.select(model)
     with pytest.raises(ValueError, match="callbacks"):
         model.learn(100, callback=states)
@@ -371,7 +371,7 @@ def test_an_environment_that_cannot_be_captured_starts_its_episode_again(tmp_pat
     learn(make(), tmp_path, stop_at=70)
     model = make()
     seen = {}
-    original = callback.ResumeStates._restore
+    original = callback.ResumeCallback._restore
 
     def look(self):
         original(self)
@@ -380,7 +380,7 @@ def test_an_environment_that_cannot_be_captured_starts_its_episode_again(tmp_pat
         seen["observations"] = model._last_obs.copy()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(callback.ResumeStates, "_restore", look)
+        patch.setattr(callback.ResumeCallback, "_restore", look)
         with pytest.warns(RuntimeWarning, match=r"with new episodes.*lock is a _thread.lock"):
             assert learn(model, tmp_path) == 60
     assert seen["pos"] == 60 // model.n_envs
@@ -427,7 +427,7 @@ def test_an_attribute_of_the_algorithm_that_cannot_be_captured_is_left_out_and_n
 def test_arguments_out_of_range(tmp_path):
     for name in ("freq", "keep"):
         with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
-            ResumeStates(tmp_path, **{name: 0})
+            ResumeCallback(tmp_path, **{name: 0})
 
 
 def test_nothing_is_pickled(tmp_path):

@@ -7,9 +7,9 @@ import gymnasium as gym
 import pytest
 from gymnasium.envs.classic_control import PendulumEnv
 
-from sb3_tdc import TDC, ResumeStates
+from sb3_tdc import TDC, ResumeCallback
 from sb3_tdc.cli import train
-from sb3_tdc.runs.callbacks.stopping import StopOnSignal
+from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback
 
 OPTIONS = ["--env", "Pendulum-v1", "-n", "120", "--eval-freq", "40", "--eval-episodes", "1", "--seed", "1"]
 SMALL = ["-params", "policy_kwargs:{net_arch: [8]}", "learning_starts:20", "batch_size:16", "buffer_size:1000"]
@@ -24,7 +24,7 @@ def stop_at(monkeypatch, call):
         self.requested = self.n_calls == call
         return not self.requested
 
-    monkeypatch.setattr(StopOnSignal, "_on_step", _on_step)
+    monkeypatch.setattr(StopOnSignalCallback, "_on_step", _on_step)
 
 
 def rows(folder):
@@ -54,7 +54,7 @@ def test_the_tables_of_sb3_need_no_warning(tmp_path):
     model = TDC("MlpPolicy", "Pendulum-v1", verbose=1, buffer_size=100, policy_kwargs={"net_arch": [8]}, device="cpu")
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        model.learn(20, callback=ResumeStates(tmp_path, freq=10))
+        model.learn(20, callback=ResumeCallback(tmp_path, freq=10))
 
 
 class Locks(PendulumEnv):

@@ -1,4 +1,4 @@
-"""ResumeStates on disk: whole or not at all, and what happens to those that are damaged."""
+"""ResumeCallback on disk: whole or not at all, and what happens to those that are damaged."""
 
 import errno
 import os
@@ -140,7 +140,7 @@ def test_one_process_at_a_time(store):
     def open_elsewhere():
         return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
 
-    sentence = f"Another process, or a newer ResumeStates in this process, writes to {store.folder.parent}"
+    sentence = f"Another process, or a newer ResumeCallback in this process, writes to {store.folder.parent}"
     assert sentence in open_elsewhere().stderr
     store.close()
     assert open_elsewhere().returncode == 0
@@ -151,7 +151,7 @@ def test_in_one_process_the_newest_has_the_folder(store):
     write(store, 1)
     second = Store(store.folder, 2, 0)
     write(second, 2)
-    with pytest.raises(LockedError, match="a newer ResumeStates in this process"):
+    with pytest.raises(LockedError, match="a newer ResumeCallback in this process"):
         store.open_again()
     with pytest.raises(LockedError):
         store.remove_all()

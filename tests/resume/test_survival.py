@@ -17,9 +17,9 @@ import yaml
 from gymnasium.envs.classic_control import PendulumEnv
 
 from sb3_tdc import TDC
-from sb3_tdc.resume import ResumeStates, stored_steps
+from sb3_tdc.resume import ResumeCallback, stored_steps
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
-from sb3_tdc.runs.callbacks.stopping import StopOnSignal, StoppableEvaluation
+from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback, StoppableEvaluation
 from tests.helpers.paths import ROOT
 from tests.helpers.training import fails, outcome, resume, run_train
 
@@ -64,7 +64,7 @@ def _processes_of_session(session):
 def test_a_second_ctrl_c_interrupts_and_a_second_sigterm_does_not(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    stop = StopOnSignal()
+    stop = StopOnSignalCallback()
     with stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.requested
@@ -73,7 +73,7 @@ def test_a_second_ctrl_c_interrupts_and_a_second_sigterm_does_not(monkeypatch):
         os.kill(os.getpid(), signal.SIGHUP)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
-    stop = StopOnSignal()
+    stop = StopOnSignalCallback()
     with stop:
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)  # of the same key: to the group and to the process
@@ -141,7 +141,7 @@ def test_a_state_that_cannot_be_written_is_tried_again_when_the_next_is_due(tmp_
         tried.append(step)
         no_space()
 
-    monkeypatch.setattr(ResumeStates, "_write", full)
+    monkeypatch.setattr(ResumeCallback, "_write", full)
     with pytest.warns(RuntimeWarning, match="The next is due in 40 steps"):
         assert run_train(tmp_path, "--eval-freq", -1, n=150) == 0
     assert tried == [0, 40, 80, 120]
@@ -249,7 +249,7 @@ def test_no_second_process_writes_a_run_whose_states_were_removed(tmp_path, at_s
     at_step(270, remove_then_resume)
     assert run_train(tmp_path) == 0
     assert errors[0].returncode == 2
-    assert "Another process, or a newer ResumeStates in this process, writes to" in errors[0].stderr
+    assert "Another process, or a newer ResumeCallback in this process, writes to" in errors[0].stderr
 
 
 def test_a_run_whose_lock_another_process_has_taken_stops_with_a_sentence(tmp_path, at_step, capsys):
@@ -257,13 +257,13 @@ def test_a_run_whose_lock_another_process_has_taken_stops_with_a_sentence(tmp_pa
 
     def take_over():
         (folder / "resume.lock").unlink()
-        others.append(ResumeStates(folder / "resume"))
+        others.append(ResumeCallback(folder / "resume"))
 
     at_step(270, take_over)
     assert run_train(tmp_path) == 1
     others[0].store.close()
     error = capsys.readouterr().err
-    assert "Another process, or a newer ResumeStates in this process, writes to" in error
+    assert "Another process, or a newer ResumeCallback in this process, writes to" in error
     assert "Traceback" not in error
 
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 from sb3_tdc.envs.vector import GymnasiumVecEnv
-from sb3_tdc.resume import ResumeStates
+from sb3_tdc.resume import ResumeCallback
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.resume.kinds.table import KINDS
 from tests.helpers.values import BOXES, LEAVES, LENT, Colour, Node, alike, build
@@ -195,7 +195,7 @@ class Grows(BaseCallback):
 
 def run(folder, callback, stop_at=None, env=None):
     model = make_model() if env is None else make_model_on(env)
-    states = ResumeStates(folder, freq=20, verbose=0)
+    states = ResumeCallback(folder, freq=20, verbose=0)
     try:
         states.select(model)
         model.learn(100, callback=[states, callback, StopAt(stop_at)])
@@ -224,7 +224,7 @@ def test_what_cannot_be_captured_any_more_is_named_once_and_ends_nothing(tmp_pat
 def test_a_usual_run_has_nothing_to_name_and_verifies_in_no_time(tmp_path):
     """Its files are left alone: they are not restored when training begins."""
     model = SAC("MlpPolicy", "HalfCheetah-v5", seed=1, device="cpu", learning_starts=10, buffer_size=200_000)
-    states = ResumeStates(tmp_path, freq=20, verbose=0)
+    states = ResumeCallback(tmp_path, freq=20, verbose=0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.learn(50, callback=states)
@@ -237,7 +237,7 @@ def test_a_usual_run_has_nothing_to_name_and_verifies_in_no_time(tmp_path):
 def test_verify_can_be_called_before_training(tmp_path):
     model = make_model()
     model.lock = threading.Lock()
-    states = ResumeStates(tmp_path, verbose=0)
+    states = ResumeCallback(tmp_path, verbose=0)
     assert states.verify(model) == ["model.lock is a _thread.lock"]
     states.store.close()
 
@@ -442,7 +442,7 @@ def run_with_infos(folder, leaf, stop_at=None):
     kwargs = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"copy_info_dict": True}}
     kwargs |= {"policy_kwargs": {"net_arch": [2]}, "buffer_size": 200, "learning_starts": 60, "batch_size": 4}
     model = SAC("MultiInputPolicy", Informs(leaf), seed=1, device="cpu", **kwargs)
-    states = ResumeStates(folder, freq=20, verbose=0)
+    states = ResumeCallback(folder, freq=20, verbose=0)
     try:
         states.select(model)
         model.learn(100, callback=[states, StopAt(stop_at)])

@@ -8,9 +8,9 @@ import torch as th
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import train
-from sb3_tdc.resume import ResumeStates
+from sb3_tdc.resume import ResumeCallback
 from sb3_tdc.runs.callbacks import busy_machine
-from sb3_tdc.runs.callbacks.busy_machine import BusyMachine
+from sb3_tdc.runs.callbacks.busy_machine import BusyMachineCallback
 from tests.helpers.command_line import SMALL
 
 # Milliseconds and processor milliseconds of single updates on two threads, measured on two cores
@@ -19,14 +19,14 @@ BUSY = [(3.6, 7.2), (9.7, 9.7), (14.0, 14.0), (102.0, 100.0)]
 
 
 class Machine:
-    """Clocks, threads and a model that a :class:`BusyMachine` sees in place of the real ones."""
+    """Clocks, threads and a model that a :class:`BusyMachineCallback` sees in place of the real ones."""
 
     def __init__(self, monkeypatch, threads=2, device="cpu"):
         self.seconds, self.processor_seconds, self.messages = 0.0, 0.0, []
         clocks = SimpleNamespace(perf_counter=lambda: self.seconds, process_time=lambda: self.processor_seconds)
         monkeypatch.setattr(busy_machine, "time", clocks)
         monkeypatch.setattr(busy_machine, "th", SimpleNamespace(get_num_threads=lambda: threads))
-        self.callback = BusyMachine(self.messages.append, "REMEDY")
+        self.callback = BusyMachineCallback(self.messages.append, "REMEDY")
         self.model = SimpleNamespace(_n_updates=0, device=th.device(device))
         self.callback.model = self.model
 
@@ -186,9 +186,9 @@ def test_states_of_a_real_run_do_not_count(tmp_path, capsys, monkeypatch):
         nonlocal passed
         passed += seconds
 
-    update, write = TDC.train, ResumeStates._save
+    update, write = TDC.train, ResumeCallback._save
     monkeypatch.setattr(TDC, "train", lambda *args, **kwargs: (pass_time(1), update(*args, **kwargs)))
-    monkeypatch.setattr(ResumeStates, "_save", lambda *args: (write(*args), pass_time(100)))
+    monkeypatch.setattr(ResumeCallback, "_save", lambda *args: (write(*args), pass_time(100)))
     clocks = SimpleNamespace(perf_counter=lambda: passed, process_time=lambda: passed)
     monkeypatch.setattr(busy_machine, "time", clocks)
     monkeypatch.setattr(busy_machine, "th", SimpleNamespace(get_num_threads=lambda: 2))

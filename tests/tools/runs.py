@@ -29,7 +29,7 @@ from sb3_tdc import MEOW, TDC
 from sb3_tdc.ablations import calibration
 from sb3_tdc.advb import AdvBSAC, AdvBTD3, AdvBTDC, BoardCallback
 from sb3_tdc.envs.registry import require_env, simulator_of
-from sb3_tdc.resume import Restorable, ResumeStates
+from sb3_tdc.resume import Restorable, ResumeCallback
 
 STEPS = 300
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
@@ -288,9 +288,9 @@ def make_callbacks(case: Case, folder: Path, stop_at: int | None) -> list[BaseCa
     )
     board = []
     if case.algorithm in (AdvBTD3, AdvBSAC, AdvBTDC):
-        test_env = _wrap(case, make_vec_env(case.env, 1, seed=6, env_kwargs=case.env_kwargs))
-        board = [BoardCallback(test_env)]
-    return [ResumeStates(folder / "resume", freq=40, verbose=0), Trace(), evaluation, *board, StopAt(stop_at)]
+        eval_env = _wrap(case, make_vec_env(case.env, 1, seed=6, env_kwargs=case.env_kwargs))
+        board = [BoardCallback(eval_env)]
+    return [ResumeCallback(folder / "resume", freq=40, verbose=0), Trace(), evaluation, *board, StopAt(stop_at)]
 
 
 def run(case: Case, folder: Path, stop_at: int | None = None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ _SHARE = 0.75
 _WASTE = 2.25
 
 
-class BusyMachine(BaseCallback):
+class BusyMachineCallback(BaseCallback):
     """
     Say once that updates have become several times slower because threads of this run wait for each other.
 

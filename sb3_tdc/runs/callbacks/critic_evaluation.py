@@ -15,7 +15,7 @@ _SHARE = 0.01
 _SECONDS_OF_FIRST_FIGURE = 2.0
 
 
-class CriticEvaluation(StoppableEvaluation):
+class CriticEvaluationCallback(StoppableEvaluation):
     """
     An evaluation that also holds TDC's critics against the returns of its episodes; of other algorithms, just that.
 

@@ -12,7 +12,7 @@ from sb3_tdc.common.transitions import check_first_observation, check_transition
 from sb3_tdc.common.words import first_of
 
 
-class FiniteGuard(BaseCallback):
+class FiniteGuardCallback(BaseCallback):
     """End training with a ``NonFiniteError`` before a transition that is not finite is stored."""
 
     is_captured = False

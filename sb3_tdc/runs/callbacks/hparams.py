@@ -6,7 +6,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 
 
-class RecordHyperparams(BaseCallback):
+class RecordHyperparamsCallback(BaseCallback):
     """
     Write hyperparameters to TensorBoard's HParams tab when training begins.
 

@@ -9,7 +9,7 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import DISK_ERRORS, save_model
 
 
-class SaveBest(BaseCallback):
+class SaveBestCallback(BaseCallback):
     """Save a new best model, and the statistics of ``VecNormalize``."""
 
     def __init__(self, folder: RunFolder):
@@ -24,7 +24,7 @@ class SaveBest(BaseCallback):
         return True
 
 
-class SavePeriodically(CheckpointCallback):
+class SavePeriodicallyCallback(CheckpointCallback):
     """SB3's callback, with finite weights only."""
 
     def _on_step(self) -> bool:

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.common.output import write_from_handler
 from sb3_tdc.envs.processes import STOP_SIGNALS
-from sb3_tdc.resume import ResumeStates
+from sb3_tdc.resume import ResumeCallback
 
 # How long a rollout may take to its end, where a resume state can be written
 _PATIENCE_SECONDS = 5.0
@@ -24,7 +24,7 @@ _PATIENCE_SECONDS = 5.0
 _ONE_SIGNAL_SECONDS = 0.2
 
 
-class StopOnSignal(BaseCallback):
+class StopOnSignalCallback(BaseCallback):
     """
     As a context, take SIGINT, SIGTERM and SIGHUP; as a callback, end training after one. A second Ctrl-C interrupts.
 
@@ -36,7 +36,7 @@ class StopOnSignal(BaseCallback):
 
     is_captured = False
 
-    def __init__(self, states: ResumeStates | None = None) -> None:
+    def __init__(self, states: ResumeCallback | None = None) -> None:
         super().__init__()
         self.requested, self.requested_at = False, 0.0
         self.states = states
@@ -44,7 +44,7 @@ class StopOnSignal(BaseCallback):
         if states is not None:
             states.is_wanted = lambda: self.requested
 
-    def __enter__(self) -> "StopOnSignal":
+    def __enter__(self) -> "StopOnSignalCallback":
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
             taken = [number for number in STOP_SIGNALS if not _is_ignored_hangup(number)]
             self.previous = {number: signal.signal(number, self._handle) for number in taken}
@@ -84,7 +84,7 @@ def _is_ignored_hangup(number: signal.Signals) -> bool:
 class StoppableEvaluation(EvalCallback):
     """An ``EvalCallback`` that a signal ends between two steps, also where an episode would never end."""
 
-    def __init__(self, eval_env: VecEnv, stop: StopOnSignal, **kwargs: Any):
+    def __init__(self, eval_env: VecEnv, stop: StopOnSignalCallback, **kwargs: Any):
         super().__init__(eval_env, **kwargs)
         self.stop = stop
 
