@@ -11,12 +11,12 @@ import numpy as np
 
 from sb3_tdc.cli.arguments import Parser
 from sb3_tdc.common.files import check_writable
-from sb3_tdc.common.plots import add_legend, import_figure, style_axes
+from sb3_tdc.common.plots import add_legend, import_figure, short_number, style_axes
 from sb3_tdc.common.words import counted
 from sb3_tdc.runs.evaluations import read_evaluations
 from sb3_tdc.runs.folder import RunFolder
 
-_LABELS_IN_A_COLUMN = 16
+_LEGEND_ROW = 0.2  # inches
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,13 @@ def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
         axes.scatter(steps, curve.returns.ravel(), s=9, alpha=0.45, color=line.get_color(), linewidths=0)
     numbers = sorted({curve.returns.shape[1] for curve in curves})
     style_axes(axes, curves[0].env_id, "environment steps", f"return of {counted(numbers, 'mean-action episode')}")
-    axes.xaxis.set_major_formatter("{x:,.0f}")
-    add_legend(axes, "outside center right", ncols=-(-len(curves) // _LABELS_IN_A_COLUMN))
+    axes.xaxis.set_major_formatter(short_number)
+    add_legend(axes, "outside lower left", ncols=1)
+
+
+def figure_size(n_curves: int) -> tuple[float, float]:
+    """Return width and height in inches, with the rows of a legend below the axes."""
+    return 7.0, 4.0 + _LEGEND_ROW * n_curves
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -102,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         curves = load_curves(args.runs, args.until)
         if len({curve.env_id for curve in curves}) > 1:
             raise ValueError("The runs must be of one environment; draw one figure for each")
-        figure = import_figure()(figsize=(7, 4), layout="constrained")
+        figure = import_figure()(figsize=figure_size(len(curves)), layout="constrained")
         kinds = sorted(figure.canvas.get_supported_filetypes())
         if args.output.suffix.removeprefix(".") not in kinds:
             raise ValueError(f"-o {args.output}: the name must end in one of .{', .'.join(kinds)}")

@@ -39,3 +39,11 @@ def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
     axes.set_ylabel(ylabel)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
+
+
+def short_number(number: float, _: int = 0) -> str:
+    """Return "300k" for 300,000, and "1.5M" for 1,500,000: a formatter of an axis."""
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if abs(number) >= size:
+            return f"{number / size:g}{unit}"
+    return f"{number:g}"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tdc.common.plots import add_legend, style_axes
+from sb3_tdc.common.plots import add_legend, short_number, style_axes
 from sb3_tdc.common.words import count, counted
 from sb3_tdc.experiments.published_curves import PublishedCurve
 from sb3_tdc.experiments.statistics import mean_interval
@@ -111,7 +111,7 @@ def draw_curves(
     values = np.concatenate(shown)
     _cut_intervals(axes, values[np.isfinite(values)], log)
     style_axes(axes, title, "environment steps", ylabel)
-    axes.xaxis.set_major_formatter(_short_number)
+    axes.xaxis.set_major_formatter(short_number)
     add_legend(axes, "outside lower left", ncols=2)
 
 
@@ -209,10 +209,3 @@ def _draw_line(axes: Any, steps: np.ndarray, values: np.ndarray, **style: Any) -
     there = np.isfinite(values)
     marker = "o" if there.sum() == 1 else None
     axes.plot(steps[there], values[there], marker=marker, ms=4, **style)
-
-
-def _short_number(number: float, _: int) -> str:
-    for size, unit in ((1e6, "M"), (1e3, "k")):
-        if abs(number) >= size:
-            return f"{number / size:g}{unit}"
-    return f"{number:g}"

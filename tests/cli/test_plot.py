@@ -1,5 +1,6 @@
 """Learning curves from the evaluations of runs."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -71,18 +72,21 @@ def test_one_episode_is_one():
     assert axes.get_ylabel() == "return of 1 mean-action episode"
 
 
+@pytest.mark.parametrize("label", ["advb_tdc, seed 1", "tdc, seed 1 (steps_300000/lam=0.0/seed_1/tdc/A-v0_1)"])
 @pytest.mark.parametrize("n_curves", [5, 8, 30])
-def test_the_legend_of_many_curves_is_outside(n_curves):
-    drawn = figure.Figure(figsize=(7, 4), layout="constrained")
+def test_the_legend_of_many_curves_is_below_the_axes(n_curves, label):
+    drawn = figure.Figure(figsize=plot.figure_size(n_curves), layout="constrained")
     axes = drawn.subplots()
-    curve = plot.Evaluated("advb_tdc, seed 1", "A-v0", np.array([1, 2]), np.array([[2.0], [3.0]]))
+    curve = plot.Evaluated(label, "A-v0", np.array([100_000, 300_000]), np.array([[2.0], [3.0]]))
     plot.draw_curves(axes, [curve] * n_curves)
     drawn.draw_without_rendering()
     (legend,) = (legend.get_window_extent() for legend in drawn.legends)
-    assert legend.x0 >= axes.get_window_extent().x1
-    assert legend.x1 <= drawn.bbox.x1
-    assert (legend.y0 >= drawn.bbox.y0, legend.y1 <= drawn.bbox.y1) == (True, True)
-    assert axes.get_window_extent().width > drawn.bbox.width / 3
+    assert legend.y1 <= axes.xaxis.label.get_window_extent().y0
+    assert (legend.x0 >= drawn.bbox.x0, legend.x1 <= drawn.bbox.x1, legend.y0 >= drawn.bbox.y0) == (True, True, True)
+    assert axes.get_window_extent().width > drawn.bbox.width * 0.8
+    assert axes.get_window_extent().height > 0.3 * drawn.bbox.height
+    ticks = [tick.get_window_extent() for tick in axes.get_xticklabels() if tick.get_text()]
+    assert all(one.x1 < other.x0 for one, other in itertools.pairwise(ticks))
 
 
 def test_what_cannot_be_drawn_is_said(tmp_path, capsys):
