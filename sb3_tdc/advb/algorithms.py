@@ -37,8 +37,9 @@ class Advised(NoisyOffPolicyAlgorithm):
         super().__init_subclass__(**kwargs)
         # What ``help``, and the notebooks that ask for it, show: the arguments of the algorithm, not *args and **kwargs
         parameters = constructor_parameters(cls)
-        parameters.pop("self")
-        cls.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+        parameters.pop("self", None)
+        in_order = sorted(parameters.values(), key=lambda p: (p.kind, p.default is not p.empty))
+        cls.__signature__ = inspect.Signature(in_order)  # type: ignore[attr-defined]
 
     def __init__(self, *args: Any, formation_period: int = 10_000, **kwargs: Any):
         self.formation_period = formation_period

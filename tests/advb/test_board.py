@@ -296,6 +296,20 @@ def test_the_board_of_tdc_scores_with_the_current_lam(tmp_path):
     assert model.policy.lam == 0.2
 
 
+def test_a_subclass_may_have_any_constructor():
+    class Extra(AdvBTD3):
+        def __init__(self, policy, env, extra=1, **kwargs):
+            super().__init__(policy, env, **kwargs)
+
+    class Required(AdvBTDC):
+        def __init__(self, extra, policy="MlpPolicy", env=None):
+            super().__init__(policy, env)
+
+    assert {"extra", "learning_rate", "formation_period"} <= set(inspect.signature(Extra).parameters)
+    assert Extra("MlpPolicy", TwoActions()).formation_period == 10_000
+    assert Required(3, env=TwoActions()).formation_period == 10_000
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [({"formation_period": -1}, "formation_period must be"), ({"n_members": 0}, "policy_kwargs.'n_members'. must be")],
