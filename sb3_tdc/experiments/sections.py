@@ -165,7 +165,7 @@ class Report:
                 section.pictures.append(self.draw_sweep(f"lambda-sweep-{number}", numbers))
         for groups in self.conditions.values():
             ablations = [one for one in compare_variants(groups) if one.variant.algo in ABLATIONS]
-            section.pictures += self.draw_comparisons(ablations)
+            section.pictures += self.draw_comparisons("variant", ablations)
         self.add_table(
             section,
             "lambda",
@@ -191,19 +191,19 @@ class Report:
         )
         compared = compare_settings(self.groups)
         for groups in self.conditions.values():
-            section.pictures += self.draw_comparisons([one for one in compared if one.variant in groups])
+            shown = [one for one in compared if one.variant in groups]
+            section.pictures += self.draw_comparisons("setting", shown)
         caption = f"Each against the same algorithm as hyperparams/ has it: {_COMPARED}"
         self.add_table(section, "settings", tables.make_comparisons_table(compared), caption)
         return section
 
-    def draw_comparisons(self, compared: Sequence[Comparison]) -> list[Picture]:
-        """Draw the learning curves of each variant next to its control."""
+    def draw_comparisons(self, name: str, compared: Sequence[Comparison]) -> list[Picture]:
+        """Draw the learning curves of each variant next to its control, under the same conditions."""
         pictures = []
-        for one in compared:
-            labels = [one.control.label, one.variant.label]
-            name = f"compared-{one.variant.label}"
+        for number, one in enumerate(compared, 1):
             shown = [one.control, one.variant]
-            pictures.append(self.draw_learning_curves(name, shown, labels, figures.colors_of(labels)))
+            labels = [group.label for group in shown]
+            pictures.append(self.draw_learning_curves(f"{name}-{number}", shown, labels, figures.colors_of(labels)))
         return pictures
 
     def draw_sweep(self, name: str, groups: Sequence[Group]) -> Picture:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from sb3_tdc.ablations import ABLATIONS
+from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.groups import (
     Group,
@@ -21,9 +22,12 @@ from sb3_tdc.experiments.groups import (
     have_same_settings,
     hyperparameters_not_shipped,
 )
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.tdc import TDC
 
 _LEVEL = 0.05
+# What an entry of hyperparams/ says of training, apart from the constructor's arguments
+_OF_TRAINING = ("noise_type", "noise_std", "n_envs", "normalize")
 _NAMES = {cls: name for name, cls in {"tdc": TDC, **ABLATIONS}.items()}
 
 
@@ -72,7 +76,8 @@ def compare_settings(groups: Sequence[Group]) -> list[Comparison]:
     """
     Return the comparisons of other hyperparameters with those of ``hyperparams/``, under all conditions.
 
-    Without λ and the head, which have their own.
+    Without λ and the head, which have their own, and without groups whose task or beginning is another: with arguments
+    of the environment, wrappers, or a trained model.
     """
     return _compare_all(groups, _other_settings)
 
@@ -103,8 +108,9 @@ def _variants(finished: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
 def _other_settings(finished: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
     controls = {control.algo: control for control in as_shipped(finished)}
     for group in finished:
-        changed = set(hyperparameters_not_shipped(group.runs[0]))
-        if group.algo in controls and changed - {"lam", "stochastic_actor"}:
+        changed = {key.partition(".")[0] for key in hyperparameters_not_shipped(group.runs[0])}
+        of_algorithm = {*constructor_parameters(KNOWN_ALGORITHMS[group.algo]), *_OF_TRAINING}
+        if group.algo in controls and changed - {"lam", "stochastic_actor"} and changed <= of_algorithm:
             yield group, controls[group.algo]
 
 

@@ -123,7 +123,7 @@ def test_ablations_are_drawn_next_to_their_control(tmp_path):
     groups = group_runs(find_runs(tmp_path / "logs")[0])
     report = sections.Report(groups, tmp_path / "report")
     (picture,) = report.lambda_sweep().pictures
-    assert picture.name == f"compared-TDC-SHIFT-{groups[0].conditions.file_name}"
+    assert picture.name == f"variant-1-{groups[0].conditions.file_name}"
     assert "TDC: 2 (1, 2); TDC-SHIFT: 1 (1)." in picture.caption
     (picture,) = report.learning_curves().pictures
     assert "TDC: 2 (1, 2); SAC: 1 (1)." in picture.caption
@@ -182,6 +182,9 @@ def test_other_settings_are_compared_with_those_of_the_file(tmp_path):
         ("td3", {}),
         ("td3", {"learning_starts": 25_000}),
         ("sac", {"tau": 0.5}),
+        ("tdc", {"args": {"env_kwargs": {"healthy_reward": 9}}}),  # another task
+        ("tdc", {"args": {"trained_agent": "old.zip"}, "kappa": 10.0}),  # more steps
+        ("tdc", {"env_wrapper": "gymnasium.wrappers.FlattenObservation", "kappa": 10.0}),
     ):
         make_runs(tmp_path, late, algo, **config)
     make_runs(tmp_path, late, "tdc", kappa=10.0, env_id="Walker2d-v4")
@@ -205,6 +208,30 @@ def test_other_settings_are_in_the_report(tmp_path):
     assert "TDC: 2 (1, 2); TDC, kappa 10: 1 (1)." in picture.caption
     assert table["Variant"].tolist() == ["TDC, kappa 10: 5.5 (1 seed)"]
     assert report.lambda_sweep().tables == []
+
+
+def test_figures_of_variants_and_of_settings_have_names_of_their_own(tmp_path):
+    """Of any settings: a name of a file has at most 255 bytes."""
+    pytest.importorskip("matplotlib")
+    many = {"learning_rate": 1e-3, "qf_learning_rate": 2e-3, "buffer_size": 1234, "batch_size": 123, "gamma": 0.123}
+    many |= {"target_policy_noise": 0.123, "target_noise_clip": 0.456, "gradient_steps": 3, "policy_delay": 3}
+    many |= {
+        "kappa": 123.0,
+        "learning_starts": 123,
+        "target_entropy": -1.23,
+        "noise_std": 0.123,
+        "ent_coef": "auto_0.1",
+    }
+    for algo in ("tdc", "tdc-shift"):
+        for config in ({}, {"tau": 0.3}, many):
+            make_runs(tmp_path / "logs", [(1.0, 2.0)], algo, **config)
+    report = sections.Report(group_runs(find_runs(tmp_path / "logs")[0]), tmp_path / "report")
+    names = [
+        picture.name for section in (report.lambda_sweep(), report.other_settings()) for picture in section.pictures
+    ]
+    assert len(names) == 7  # three of tdc-shift next to tdc; two settings of each
+    assert len({*names}) == 7
+    assert all((tmp_path / "report" / "figures" / f"{name}.png").is_file() for name in names)
 
 
 def test_other_settings_by_scipy(tmp_path):
