@@ -210,8 +210,9 @@ class RunFolder:
         _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
 
     def mark_unfinished(self) -> None:
-        """Record that the run begins again."""
+        """Record that the run begins again, with the hyperparameters that it has now."""
         self._finished.unlink(missing_ok=True)
+        self._changes.unlink(missing_ok=True)
 
     def checkpoints(self) -> dict[int, Path]:
         """Return the models of ``--save-freq``, by timestep, oldest first."""

@@ -1,5 +1,6 @@
 """From settings to a run that can be trained: everything is checked before anything is made."""
 
+import shlex
 import shutil
 import textwrap
 from dataclasses import fields
@@ -11,7 +12,6 @@ import numpy as np
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.common.commands import command
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
@@ -112,14 +112,15 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     if not (folder.path / folder.env_name / "args.yml").is_file():
         raise ValueError(f"{folder.path} was stopped before its run began: start a new one")
     settings = _resumed_settings(folder, {**given, **_absolute(given)})
-    config, changed = folder.config, dict(given.get("hyperparams", {}))
-    if (length := _new_length(given)) is not None:
-        changed["n_timesteps"] = length
-    differing = {name: value for name, value in changed.items() if name not in config or config[name] != value}
+    where, config = str(folder.path / folder.env_name / "config.yml"), folder.config
+    before = _stored_length(folder, where)
+    length = before if (new := _new_length(given)) is None else new
     if folder.is_finished and not settings.start_over:
-        if "n_timesteps" in differing:
-            _refuse_to_prolong(folder, settings, differing["n_timesteps"])
+        if length != before:
+            _refuse_to_prolong(folder, length)
         return None
+    wanted = {**given.get("hyperparams", {}), "n_timesteps": length}
+    differing = {name: value for name, value in wanted.items() if name not in config or config[name] != value}
     if not settings.writes_states:
         raise ValueError(f"{folder.path} has no resume states: it was trained with --resume-freq -1")
     has_state = bool(stored_steps(folder.resume_folder)) and not settings.start_over
@@ -129,12 +130,20 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
             "--start-over begins at step 0 again, and overwrites the results"
         )
     _prepare(settings)
-    where = str(folder.path / folder.env_name / "config.yml")
     hyperparams = parse(config, KNOWN_ALGORITHMS[settings.algo], where, differing, _COMMAND_LINE)
-    former_length = folder.n_timesteps if "n_timesteps" in differing else None
     set_random_seed(settings.seed)
     others = tuple(name for name in differing if name != "n_timesteps")
-    return TrainingRun(settings, hyperparams, folder, others, former_length)
+    return TrainingRun(settings, hyperparams, folder, others, former_length=before if length != before else None)
+
+
+def _stored_length(folder: RunFolder, where: str) -> int:
+    """
+    Return the steps that a run was to take.
+
+    :raises ValueError: if ``config.yml``, which may have been edited, has no such number
+    """
+    convert_mapping({"n_timesteps": folder.config.get("n_timesteps")}, {"n_timesteps": int}, where)
+    return folder.n_timesteps
 
 
 def _new_length(given: dict[str, Any]) -> int | None:
@@ -149,19 +158,19 @@ def _new_length(given: dict[str, Any]) -> int | None:
     return convert_mapping(named, {"n_timesteps": int}, _COMMAND_LINE).get("n_timesteps")
 
 
-def _refuse_to_prolong(folder: RunFolder, settings: RunSettings, length: int) -> None:
+def _refuse_to_prolong(folder: RunFolder, length: int) -> None:
     """
     Refuse another length of a finished run, which has no resume states.
 
-    :raises ValueError: with the command to train its model further
+    :raises ValueError: with the way to train its model further
     """
     steps = folder.steps_at_end if folder.steps_at_end is not None else folder.steps_of_model()
     if length <= steps:
         raise ValueError(f"{folder.path} is finished, at step {steps:,}: n_timesteps {length} adds none")
-    flags = ("--algo", settings.algo, "--env", settings.env, "-i", folder.model, "-n", length - steps)
+    further = shlex.join(["-i", str(folder.model), "-n", str(length - steps)])
     raise ValueError(
-        f"{folder.path} is finished, at step {steps:,}, and a finished run has no resume states: "
-        f"train its model further in a new run, by {command('train', *flags)}"
+        f"{folder.path} is finished, at step {steps:,}, and a finished run has no resume states: train its model "
+        f"further in a new run, by its command ({folder.path / folder.env_name / 'command.txt'}) with {further}"
     )
 
 

@@ -270,16 +270,16 @@ def _select_state(run: TrainingRun, states: ResumeCallback, model: OffPolicyAlgo
     # Whatever has ever been changed is as in config.yml: the state may be older than the change
     earlier = [name for change in folder.changes for name in change["hyperparams"] if name != "n_timesteps"]
     step = states.select(model, run.settings.from_step, [*earlier, *run.changed]) or 0
+    changed = run.changed if step > 0 else ()  # from the beginning on, it is a run like any other
     if run.former_length is None:
         if run.changed:
-            folder.record_change(step, run.hyperparams.raw, run.changed)
+            folder.record_change(step, run.hyperparams.raw, changed)
         return
     if length <= step:
         raise ValueError(f"n_timesteps must be above {step:,}, the step of the resume state, got {length}")
     # With a schedule, the steps so far are not those of a run of the new length
     is_another = step > 0 and bool(run.hyperparams.schedules)
-    changed = (*run.changed, "n_timesteps") if is_another else run.changed
-    folder.record_change(step, run.hyperparams.raw, changed)
+    folder.record_change(step, run.hyperparams.raw, (*changed, "n_timesteps") if is_another else changed)
     folder.record_length(length)
 
 

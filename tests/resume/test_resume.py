@@ -143,13 +143,47 @@ def test_schedules_follow_the_new_length(stopped, capsys):
     assert RunFolder.open(stopped).changes == changes
 
 
+def test_a_run_of_rl_zoo_has_the_length_of_its_flag(tmp_path, capsys):
+    """It keeps ``-n`` out of its hyperparameters."""
+    assert run_train(tmp_path, n=150) == 0
+    run = RunFolder.open(tmp_path / "tdc" / "Hopper-v4_1")
+    folder = run.path / "Hopper-v4"
+    config = {**run.config, "n_timesteps": 20_000}
+    args = {name: value for name, value in run.args.items() if name != "resume_freq"}
+    (folder / "config.yml").write_text(plain_yaml.dump(config))
+    (folder / "args.yml").write_text(plain_yaml.dump({**args, "n_timesteps": 150}))
+    capsys.readouterr()
+    assert resume(run.path, "-n", "150") == 0
+    assert "is finished: there is nothing to resume" in capsys.readouterr().out
+    assert "with -i" in fails(lambda: resume(run.path, "-n", "20000"), capsys)
+    assert resume(run.path, "--start-over") == 0
+    assert RunFolder.open(run.path).steps_at_end == 150
+
+
+@pytest.mark.parametrize("edited", ["many", None, 1.5, [3]])
+def test_a_length_that_is_no_number_is_named(stopped, edited, capsys):
+    config = stopped / "Hopper-v4" / "config.yml"
+    config.write_text(plain_yaml.dump({**RunFolder.open(stopped).config, "n_timesteps": edited}))
+    error = fails(lambda: resume(stopped), capsys)
+    assert f"{config}: n_timesteps" in error
+    assert "Traceback" not in error
+
+
+def test_a_run_that_starts_over_with_other_hyperparameters_is_one_of_these(stopped):
+    assert resume(stopped, "-n", "280", "-params", "lam:0.25") == 0
+    assert RunFolder.open(stopped).changes == [{"step": 270, "hyperparams": {"lam": 0.25}}]
+    assert resume(stopped, "--start-over", "-params", "tau:0.01") == 0
+    run = RunFolder.open(stopped)
+    assert (run.changes, run.config["lam"], run.config["tau"]) == ([], 0.25, 0.01)
+
+
 def test_a_finished_run_cannot_be_made_longer(tmp_path, capsys):
     assert run_train(tmp_path, n=150) == 0
     folder = tmp_path / "tdc" / "Hopper-v4_1"
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     error = fails(lambda: resume(folder, "-n", "200"), capsys)
     assert "is finished, at step 150, and a finished run has no resume states: train its model further" in error
-    assert f"sb3-tdc train --algo tdc --env Hopper-v4 -i {folder / 'Hopper-v4.zip'} -n 50\n" in error
+    assert f"-i {folder / 'Hopper-v4.zip'} -n 50" in error
     assert "n_timesteps 120 adds none" in fails(lambda: resume(folder, "-params", "n_timesteps:120"), capsys)
     assert resume(folder, "-n", "150") == 0
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
