@@ -58,6 +58,8 @@ def play_episodes(
     :param env: one environment, under a ``Monitor``
     :param n_timesteps: stop after this many steps; None for no end
     """
+    if n_timesteps is not None and n_timesteps < 1:
+        return
     for n, step in enumerate(play_steps(model, env, deterministic), start=1):
         if step.done:
             yield PlayedEpisode(float(step.info["episode"]["r"]), int(step.info["episode"]["l"]))

@@ -252,6 +252,8 @@ def record_episodes(model: TDC, env: VecEnv, n_episodes: int, limit: int | None 
     """
     recording = Recording(model)
     episodes: list[Episode] = []
+    if n_episodes < 1:
+        return episodes
     for step in play_steps(model, env):
         seen = step.observation
         recording.add(
