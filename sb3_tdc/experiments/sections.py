@@ -163,9 +163,8 @@ class Report:
             numbers = [group for group in groups if group.finished and not isinstance(group.setting("lam"), str)]
             if len(numbers) > 1:
                 section.pictures.append(self.draw_sweep(f"lambda-sweep-{number}", numbers))
-        for groups in self.conditions.values():
-            ablations = [one for one in compare_variants(groups) if one.variant.algo in ABLATIONS]
-            section.pictures += self.draw_comparisons("variant", ablations)
+        compared = compare_variants(self.groups)
+        section.pictures += self.draw_comparisons("variant", [one for one in compared if one.variant.algo in ABLATIONS])
         self.add_table(
             section,
             "lambda",
@@ -178,7 +177,7 @@ class Report:
         self.add_table(
             section,
             "variants",
-            tables.make_comparisons_table(compare_variants(self.groups)),
+            tables.make_comparisons_table(compared),
             f"Variants of TDC, each against the control that differs in one thing: {_COMPARED}",
         )
         return section
@@ -190,20 +189,20 @@ class Report:
             "has it. λ and the head alone have sections of their own.",
         )
         compared = compare_settings(self.groups)
-        for groups in self.conditions.values():
-            shown = [one for one in compared if one.variant in groups]
-            section.pictures += self.draw_comparisons("setting", shown)
+        section.pictures += self.draw_comparisons("setting", compared)
         caption = f"Each against the same algorithm as hyperparams/ has it: {_COMPARED}"
         self.add_table(section, "settings", tables.make_comparisons_table(compared), caption)
         return section
 
     def draw_comparisons(self, name: str, compared: Sequence[Comparison]) -> list[Picture]:
-        """Draw the learning curves of each variant next to its control, under the same conditions."""
+        """Draw the learning curves of each variant next to its control, numbered under the same conditions."""
         pictures = []
-        for number, one in enumerate(compared, 1):
-            shown = [one.control, one.variant]
-            labels = [group.label for group in shown]
-            pictures.append(self.draw_learning_curves(f"{name}-{number}", shown, labels, figures.colors_of(labels)))
+        for conditions in self.conditions:
+            alike = [one for one in compared if one.variant.conditions == conditions]
+            for number, one in enumerate(alike, 1):
+                shown = [one.control, one.variant]
+                labels = [group.label for group in shown]
+                pictures.append(self.draw_learning_curves(f"{name}-{number}", shown, labels, figures.colors_of(labels)))
         return pictures
 
     def draw_sweep(self, name: str, groups: Sequence[Group]) -> Picture:
