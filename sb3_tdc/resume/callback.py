@@ -1,4 +1,4 @@
-"""The callback that writes the states of a run, and restores one of them."""
+"""Callback that writes the resume states of a run, and restores one of them."""
 
 import io
 import json
@@ -30,28 +30,28 @@ from sb3_tdc.resume.walk import Initial, NotRestoredError
 DEFAULT_FREQ = 10_000
 # The beginning of a sentence about one of several environments
 _ENVIRONMENT = re.compile(r".*?, environment \d+(?=: )")
-# The older state that stays is between this and twice this many times ``freq`` steps older than the newest
+# The older state that stays is between ``_OLDER * freq`` and twice as many steps older than the newest
 _OLDER = 10
 
 
 class ResumeCallback(BaseCallback):
     """
-    Write states from which a run continues as if it had never been stopped. Must be the first callback::
+    Callback that writes states from which a run continues as if it had never been stopped. It must come first::
 
         states = ResumeCallback("my_run/resume")
         states.select(model)  # nothing happens if there are none yet
         model.learn(1_000_000, callback=[states, ...])
 
-    One is written before the first step, then every ``freq`` steps and before every evaluation, when a rollout starts:
-    at no other moment do the objects hold the whole state.
+    A state is written before the first step, then every ``freq`` steps and before every evaluation. It is written when
+    a rollout starts: at no other moment do the objects hold the whole state.
 
-    :param folder: of the states; of one run
+    :param folder: folder of the states; every run needs its own
     :param freq: minimum number of environment steps between regular states
-    :param keep: how many of the newest stay on disk. One older state also stays, for going back before a divergence,
-        and the one that will replace it
-    :param files: files that callbacks rewrite and that belong to the state; those of an ``EvalCallback`` do
+    :param keep: number of the newest states that stay on disk. One older state also stays, for going back before a
+        divergence, together with the state that will replace it
+    :param files: files that callbacks rewrite and that belong to the state, in addition to those of an ``EvalCallback``
     :param hyperparams: plain values that the run was built from; a resumed run with another value is refused
-    :param verbose: 0: no messages but warnings
+    :param verbose: 0 for warnings only
     :raises ValueError: if ``freq`` or ``keep`` is below 1, or another process writes to the folder
     """
 
@@ -74,13 +74,13 @@ class ResumeCallback(BaseCallback):
         self.store = Store(Path(folder), keep, span=_OLDER * freq)
         self.is_wanted: Callable[[], bool] = lambda: False
         self.hyperparams = json.loads(json.dumps(dict(hyperparams or {}), default=str))
-        self.last_step: int | None = None  # of the newest state
-        self.last_try: int | None = None  # the same, or of one that could not be written
-        self.seconds = 0.0  # that training has waited for states
+        self.last_step: int | None = None  # timestep of the newest state
+        self.last_try: int | None = None  # the same, or timestep of a later state that could not be written
+        self.seconds = 0.0  # time for which training has waited for states
         self._to_restore: Stored | None = None
         self._parts: dict[str, Any] = {}
         self._changed: tuple[str, ...] = ()
-        self.root: BaseCallback = self  # of all callbacks, while training
+        self.root: BaseCallback = self  # root of all callbacks during training
         self._initial: Initial | None = None  # what was captured when training began
         self._told: set[str] = set()
         self._segments: list[replay_file.Segment] = []
@@ -94,12 +94,12 @@ class ResumeCallback(BaseCallback):
         """
         Choose the newest intact state; the next ``model.learn`` continues from it.
 
-        :param model: built as for the first run, with its environments
-        :param step: go back to the state of this step; those after it are removed when training begins
+        :param model: the model, built as for the first run, with its environments
+        :param step: go back to the state of this step; later states are removed when training begins
         :param changed: hyperparameters that keep the model's new value, not the state's, for instance ``learning_rate``
-        :return: the timestep it will continue from, None if there is no state yet
-        :raises ValueError: if it is of another algorithm or environment, if there are some and none is intact, or if
-            there is none of that step
+        :return: the timestep from which training will continue; None if there is no state yet
+        :raises ValueError: if the state is of another algorithm or environment, if a hyperparameter differs or cannot
+            be changed, if there are states but none is intact, or if there is no state of ``step``
         """
         for name in changed:
             if name not in (allowed := run_state.changeable(model)):
@@ -127,7 +127,7 @@ class ResumeCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.root = self.locals["callback"]
-        self.store.open_again()  # before anything of another's is removed or put back
+        self.store.open_again()  # refuses a folder locked by another, before any file is removed or restored
         if self._to_restore is None:
             newest = max(self.store.steps(), default=None)
             if newest is not None and newest != self.last_step:
@@ -136,10 +136,10 @@ class ResumeCallback(BaseCallback):
                     "or choose another folder"
                 )
             return
-        self.model.num_timesteps = self._to_restore.step  # for the callbacks after this one
+        self.model.num_timesteps = self._to_restore.step  # the callbacks after this one need it
         if self._to_restore.step >= self.locals["total_timesteps"]:
             self._verify()
-            self._restore()  # there will be no rollout
+            self._restore()  # now, since there will be no rollout
 
     def _restore(self) -> None:
         stored, parts = self._to_restore, self._parts
@@ -162,7 +162,7 @@ class ResumeCallback(BaseCallback):
         self.store.remove_after(stored.step)
         self._digests, self.last_step, self.last_try = dict(stored.shared), stored.step, stored.step
         self._before = model.replay_buffer.pos, stored.step
-        if restarted:  # the end of an episode was written into the last slot
+        if restarted:  # the last slot now ends its episodes, and must be written again
             self._before = (model.replay_buffer.pos - 1) % model.replay_buffer.buffer_size, stored.step - model.n_envs
         self._to_restore = None
         self._tell_what_differs(parts["platform"], restarted)
@@ -189,16 +189,18 @@ class ResumeCallback(BaseCallback):
 
     def verify(self, model: OffPolicyAlgorithm) -> list[str]:
         """
-        Find out what a resumed run would not have: capture everything but weights and transitions, restore it into
-        the same objects, capture it again and compare. Training begins with it; what it names is told in warnings.
+        Find the values that a resumed run would not have.
 
-        :param model: with its environments; outside ``learn``, callbacks are not looked at
-        :return: a sentence for each, which begins with its path
+        Everything but weights and transitions is captured, restored into the same objects, captured again and compared.
+        Training begins with the same check, and issues its sentences as warnings.
+
+        :param model: the model, with its environments; before ``learn``, callbacks are not checked
+        :return: a sentence for each value that a resumed run would not have, beginning with its path
         """
         return run_state.verify(model, self.root)[0]
 
     def _verify(self) -> None:
-        """Tell what a resumed run would not have: at the start, and again in every process that resumes."""
+        """Warn of the values that a resumed run would not have, at the start of training in every process."""
         names, self._initial = run_state.verify(self.model, self.root)  # type: ignore[arg-type]
         self._tell(names)
 
@@ -222,7 +224,7 @@ class ResumeCallback(BaseCallback):
             self.seconds += time.perf_counter() - start
 
     def _evaluation_is_next(self) -> bool:
-        """Return whether the rollout that starts has an evaluation in it, unless it is as long as episodes are."""
+        """Return whether the rollout that starts contains an evaluation; False if rollouts are measured in episodes."""
         train_freq: Any = self.model.train_freq  # type: ignore[attr-defined]
         if train_freq.unit != TrainFrequencyUnit.STEP:
             return False
@@ -294,7 +296,7 @@ class ResumeCallback(BaseCallback):
         return segments, {segment.name: digests[segment.name] for segment in segments}
 
     def _copier(self, file: Path) -> Callable[[Path], None]:
-        """Return what copies a file: as a link to the last state's copy, if it has not changed since."""
+        """Return a function that copies a file, or links to the last state's copy if the file has not changed since."""
 
         def copy(path: Path) -> None:
             now = file.stat()
@@ -303,7 +305,7 @@ class ResumeCallback(BaseCallback):
                     os.link(self._kept[file][1], path)
                     return
                 except OSError:
-                    pass  # a file system without links
+                    pass  # a file system without hard links
             shutil.copyfile(file, path)
 
         return copy
@@ -324,7 +326,7 @@ class ResumeCallback(BaseCallback):
 
 
 def _without_repetition(sentences: Iterable[str]) -> list[str]:
-    """Return sentences about what is left out, and one for all environments of which the same is said."""
+    """Return the sentences without repetition: those that differ only in their environment become one."""
     places: dict[str, list[str]] = {}
     for sentence in dict.fromkeys(sentences):
         environment = _ENVIRONMENT.match(sentence)
@@ -337,7 +339,7 @@ def _without_repetition(sentences: Iterable[str]) -> list[str]:
 
 
 def _save_weights(weights: dict[str, Any], path: Path) -> None:
-    content = io.BytesIO()  # PyTorch's own writer hides what is wrong with a disk in a RuntimeError
+    content = io.BytesIO()  # PyTorch's own writer hides disk errors in a RuntimeError
     th.save(weights, content)
     path.write_bytes(content.getbuffer())
 

@@ -1,4 +1,4 @@
-"""Two captures compared, without the code that restores."""
+"""Comparison of two captures, independent of the code that restores them."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from sb3_tdc.resume.walk import Capture
 
 def differences(before: Capture, after: Capture) -> list[str]:
     """
-    Compare what was captured of every attribute that can be left out, bit by bit.
+    Compare two captures bit by bit, for every attribute that may be left out of a state.
 
-    :return: the paths of those that differ, of the innermost where one holds another
+    :return: the paths of the attributes that differ; if one attribute contains another, only the innermost
     """
     paths = [*before.attributes, *(path for path in after.attributes if path not in before.attributes)]
     differing = [path for path in paths if _canonical(before, path) != _canonical(after, path)]
@@ -23,7 +23,13 @@ def differences(before: Capture, after: Capture) -> list[str]:
 
 
 def _canonical(capture: Capture, path: str) -> Any:
-    """Return an attribute with arrays in the place of their numbers, and objects numbered in the order they come in."""
+    """
+    Return a captured attribute in a form that can be compared across captures.
+
+    References to arrays are replaced by the arrays, and objects are numbered in the order in which they appear.
+
+    :return: the converted attribute; None if the capture does not contain it
+    """
     numbers: dict[Any, int] = {}
     first = capture.first_arrays.get(path, 0)
 

@@ -1,4 +1,4 @@
-"""Vectorised environments, and each environment with all of its wrappers, captured in the middle of an episode."""
+"""Capture of vectorised environments, and of each environment with all of its wrappers, in the middle of an episode."""
 
 from typing import Any
 
@@ -29,8 +29,8 @@ def capture_env(kinds: Kinds, env: gym.Env) -> dict[str, Any]:
     """
     Capture one environment with all of its wrappers.
 
-    :return: of plain values and arrays: generators and the ``Monitor``, so that these continue whatever else does not;
-        then the environment, or why it cannot be captured
+    :return: a dict of plain values and arrays. Generators and the ``Monitor`` are captured separately, so that they
+        continue even if the rest does not; then the whole environment, or the reason why it cannot be captured
     """
     monitors = _monitors(env)
     context = Capture(kinds, _known(monitors))
@@ -56,11 +56,11 @@ def restore_env(
     kinds: Kinds, env: gym.Env, state: dict[str, Any], with_files: bool, locations: Locations
 ) -> str | None:
     """
-    Restore what :func:`capture_env` has captured.
+    Restore one environment from the result of :func:`capture_env`.
 
-    :param with_files: restore files too
-    :param locations: with the texts that this environment was built with
-    :return: None, or why the episode has to be started again
+    :param with_files: restore files, too
+    :param locations: the locations of the run's files, with the texts that this environment was built with
+    :return: None, or the reason why the episode must start again
     """
     if state["content"] is None:
         return state["why"]
@@ -98,7 +98,7 @@ def _without_env(monitor: Monitor) -> dict[str, Any]:
 
 
 def _owners(env: gym.Env) -> dict[str, Any]:
-    """Return what has generators: an environment, its wrappers, and their spaces."""
+    """Return the objects that may hold generators: an environment, its wrappers, and their spaces."""
     layers = {f"env{'.env' * i}": layer for i, layer in enumerate(_layers(env))}
     spaces = ("action_space", "observation_space")
     parts = {f"{name}.{space}": vars(layer).get(space) for name, layer in layers.items() for space in spaces}
@@ -122,12 +122,12 @@ def _restore_generators(context: Restore, captured: dict[str, Any], owners: dict
 
 
 def is_vec_env(value: Any) -> bool:
-    """Return whether a value has the environments."""
+    """Return whether a value is a vectorised environment whose environments are captured one by one."""
     return isinstance(value, (DummyVecEnv, SubprocVecEnv))
 
 
 def capture_vec_env(context: Capture, env: Any, path: str) -> Any:
-    """Return every environment, in this process or its own."""
+    """Return the state of every environment, captured in the process that runs it, and ``env``'s own attributes."""
     if isinstance(env, DummyVecEnv):
         states = [capture_env(context.kinds, single) for single in env.envs]
     elif env.has_attr("capture_state"):
@@ -165,7 +165,7 @@ def _tell_what_is_not_covered(context: Capture, state: dict[str, Any], path: str
 
 
 def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Give every environment its state, and note those whose episode has to start again."""
+    """Restore the state of every environment, and note the environments whose episodes must start again."""
     env = existing_as((DummyVecEnv, SubprocVecEnv), existing, path)
     captured, attributes = content
     if len(captured) != env.num_envs:
@@ -185,21 +185,25 @@ def restore_vec_env(context: Restore, content: Any, existing: Any, path: str) ->
 
 
 def _own_attributes(env: VecEnv) -> dict[str, Any]:
-    """Return the attributes that are captured: every step overwrites the others."""
+    """Return the attributes of a vectorised environment that are captured; every step overwrites the others."""
     names = ("observation_space", "action_space", "_seeds", "_options")
     return {name: vars(env)[name] for name in names}
 
 
-# ---------------------------------------------------------------- those that are one object
+# ---------------------------------------------------------------- vectorised environments captured as one object
 
 
 def is_other_vec_env(value: Any) -> bool:
-    """Return whether a value has the environments, and none of them can be captured on its own."""
+    """Return whether a value is a vectorised environment whose environments cannot be captured one by one."""
     return isinstance(value, VecEnv) and not isinstance(value, (DummyVecEnv, SubprocVecEnv, VecEnvWrapper))
 
 
 def capture_other_vec_env(context: Capture, env: Any, path: str) -> Any:
-    """Return the class; generators, so that these continue whatever else does not; all attributes, or why not."""
+    """
+    Return the class, the generators, and all attributes or the reason why they are not captured.
+
+    The generators are captured separately, so that they continue even if the rest does not.
+    """
     generators = _capture_generators(context, _inside(env, path))
     n_left_out, mark = len(context.left_out), context.mark()
     attributes: dict[str, Any] = {}
@@ -208,14 +212,14 @@ def capture_other_vec_env(context: Capture, env: Any, path: str) -> Any:
     else:
         attributes = context.capture_attributes(attributes_of(env), path, optional=True)
     why = next(iter(context.left_out[n_left_out:]), None)
-    if why is not None:  # numbers of handles without what they stand for would do harm
+    if why is not None:  # handles restored without the native objects they refer to would do harm
         context.return_to(mark)
         attributes = {}
     return {"class": name_of(type(env)), "generators": generators, "attributes": attributes, "why": why}
 
 
 def restore_other_vec_env(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Give environments their state, or note why their episodes have to start again."""
+    """Restore the state of vectorised environments, or note why their episodes must start again."""
     claim(context, content["class"], existing, path)
     context.begin(existing)
     _restore_generators(context, content["generators"], _inside(existing, path))
@@ -233,10 +237,10 @@ def restore_other_vec_env(context: Restore, content: Any, existing: Any, path: s
 
 
 def _inside(env: VecEnv, path: str) -> dict[str, Any]:
-    """Return vectorised environments, the environments in them, and all of their spaces, by path."""
+    """Return a vectorised environment, the environments in it, and all of their spaces, by path."""
     found: list[tuple[str, Any]] = [(path, env)]
     seen = {id(env)}
-    for place, part in found:  # grows
+    for place, part in found:  # grows in the loop
         for name, value in attributes_of(part).items():
             items = enumerate(value) if isinstance(value, (list, tuple)) else [(None, value)]
             for i, item in items:
@@ -250,17 +254,17 @@ def _inside(env: VecEnv, path: str) -> dict[str, Any]:
 
 
 def is_event_files(value: Any) -> bool:
-    """Return whether a value writes event files."""
+    """Return whether a value writes TensorBoard's event files."""
     return isinstance(value, TensorBoardOutputFormat)
 
 
 def capture_output(context: Capture, value: TensorBoardOutputFormat, path: str) -> Any:
-    """Return how far the event files go."""
+    """Return the folder and the sizes of the event files."""
     return context.capture(capture_event_files(value), path)
 
 
 def restore_output(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Cut event files to what they were."""
+    """Cut event files to their captured sizes."""
     output = existing_as(TensorBoardOutputFormat, existing, path)
     state = context.restore(content, MISSING, path)
     if context.with_files:

@@ -1,4 +1,4 @@
-"""TensorBoard's event files: cut back to where they were, and continued in a new one without a gap or a duplicate."""
+"""TensorBoard's event files: cut to their captured sizes, then continued in a new file without a gap or a duplicate."""
 
 import os
 import re
@@ -17,7 +17,7 @@ from sb3_tdc.resume.locations import Locations
 
 
 def capture_event_files(output: TensorBoardOutputFormat) -> dict[str, Any]:
-    """Return the folder and the size of every event file in it, in bytes."""
+    """Return the folder of the event files, and the size of each file in it in bytes."""
     output.writer.flush()
     folder = Path(output.writer.log_dir)
     sizes = {}
@@ -32,12 +32,12 @@ def restore_event_files(
     output: TensorBoardOutputFormat, state: dict[str, Any], step: int, locations: Locations
 ) -> None:
     """
-    Drop what this process has written so far, and what was written after the state was captured.
+    Remove the events that this process has written so far, and those written after the state was captured.
 
-    The files stay in their folder. If that is outside the run's folder and this run is a copy, it belongs to the
-    original: the copy continues with copies of the files, in the folder that was made for this process.
+    The files stay in their folder. If this folder is outside the run's folder and the run is a copy, the folder belongs
+    to the original run. The copy then continues with copies of the files, in the folder made for this process.
 
-    :param step: a TensorBoard that watches is told to forget what it has seen beyond
+    :param step: the timestep of the state; a TensorBoard that is watching discards the events that it has seen after it
     """
     from torch.utils.tensorboard.writer import SummaryWriter
 
@@ -45,7 +45,7 @@ def restore_event_files(
     opened, folder = Path(output.writer.log_dir), Path(state["folder"])
     if not folder.is_dir():
         folder = opened
-    if not folder.samefile(opened):  # made for this process
+    if not folder.samefile(opened):  # the opened folder was made for this process
         for path in _event_files(opened):
             path.unlink()
         if locations.is_copy and not locations.contains(folder):
@@ -67,9 +67,10 @@ def restore_event_files(
 @contextmanager
 def _named_after(names: Iterable[str]) -> Iterator[None]:
     """
-    Let an event file that is opened in this block come after others in the order of names, in which they are read.
+    Give an event file that is opened in this block a name that sorts after the given ones.
 
-    The names begin with the second in which a file was opened: the clock may have been set back since, or be the same.
+    TensorBoard reads event files in the order of their names, which begin with the second in which they were opened.
+    Since then, the clock may have been set back, or the second may not have passed.
     """
     from tensorboard.summary.writer import event_file_writer
 

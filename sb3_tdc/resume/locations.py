@@ -1,4 +1,4 @@
-"""Where the files of a run were when its state was captured, and where they are now."""
+"""Locations of a run's files: where they were when the state was captured, and where they are now."""
 
 import os
 from dataclasses import dataclass, field, replace
@@ -9,16 +9,18 @@ from typing import Any
 @dataclass(frozen=True)
 class Locations:
     """
-    Find the present location for every text and path in a captured state.
+    Mapping from the texts and paths in a captured state to their present locations.
 
-    A location that never changed since the run was built stays as it is built now; one in the run's folder moves with
-    the folder; any other is what it was. It is plain data, so that it reaches environments in other processes.
+    A location that the run has not changed since it was built takes the value that it is built with now. A changed
+    location in the run's folder moves with the folder. Any other location keeps its captured value. All fields are
+    plain data, so that they can be sent to environments in other processes.
 
     :param directory: the working directory of the process that captured the state
-    :param folders: how the run's folder was reached from there: its absolute path, with and without symbolic links
+    :param folders: the run's folder at that time: its absolute path, before and after symbolic links are resolved
     :param folder: the run's folder now
-    :param built: the texts that objects were built with, by path
-    :param given: the relative path with which relative locations in the run's folder begin; empty if none are known
+    :param built: the texts that objects were built with, by path in the state
+    :param given: the relative path with which relative locations in the run's folder begin; empty if they cannot be
+        recognised
     """
 
     directory: str = ""
@@ -29,9 +31,10 @@ class Locations:
 
     @classmethod
     def capture(cls, folder: Path, built: dict[str, str]) -> dict[str, Any]:
-        """Return as JSON what :meth:`restore` takes."""
+        """Return the locations of a run as JSON, for :meth:`restore`."""
         directory, resolved = os.getcwd(), os.path.realpath(folder)
-        # Below the run's folder it is ".", or "..": any text with a slash could be a file of it
+        # If the working directory is in the run's folder, the relative path is "." or "..": any text with a slash
+        # could then be a file of the run
         is_telling = not folder.is_absolute() and not Path(directory).is_relative_to(resolved)
         return {
             "directory": directory,
@@ -43,7 +46,7 @@ class Locations:
     @classmethod
     def restore(cls, captured: dict[str, Any], folder: Path) -> "Locations":
         """
-        Read the locations of a state.
+        Read the locations from a state.
 
         :param folder: the run's folder now
         """
@@ -51,17 +54,17 @@ class Locations:
         return cls(directory, folders, str(folder), captured["built"], captured.get("given", ""))
 
     def below(self, path: str) -> "Locations":
-        """Return the same for a nested capture, whose paths begin after ``path``."""
+        """Return the locations for a nested capture, whose paths lack the prefix ``path``."""
         texts = {name.removeprefix(path): text for name, text in self.built.items() if name.startswith(path)}
         return replace(self, built=texts)
 
     def of_names(self) -> "Locations":
-        """Return the same for texts that are names: none but an absolute one is taken for a location."""
+        """Return the locations for texts that are names: only an absolute path is taken for a location."""
         return replace(self, given="")
 
     @property
     def is_copy(self) -> bool:
-        """Return whether the folder that the state was captured in still exists elsewhere."""
+        """Return whether this run is a copy: the folder that the state was captured in still exists elsewhere."""
         return any(os.path.isdir(then) and not os.path.samefile(then, self.folder) for then in self.folders)
 
     def contains(self, path: Path) -> bool:
@@ -70,13 +73,13 @@ class Locations:
 
     def find(self, text: str, existing: Any, path: str, is_path: bool = False) -> str:
         """
-        Find a captured text again, as it is in this run.
+        Return the value that a captured text takes in this run.
 
-        :param text: perhaps a location
+        :param text: the captured text, which may be a location
         :param existing: the text that was built in its place now, if any
-        :param path: how the text is reached in the state
-        :param is_path: whether it certainly is a location; else it is one if it, or what is there now, has a slash
-        :return: the text in its place from now on
+        :param path: the path of the text in the state
+        :param is_path: whether the text certainly is a location; otherwise it is one if it or ``existing`` has a slash
+        :return: the text to put in its place
         """
         if not self.folders:
             return text
@@ -89,7 +92,7 @@ class Locations:
         return text if inside is None else os.path.normpath(os.path.join(self.folder, inside))
 
     def _inside(self, text: str, is_path: bool) -> str | None:
-        """Return a location relative to the run's folder; None if it lies elsewhere, or is none."""
+        """Return a location relative to the run's folder; None if it lies elsewhere or is not a location."""
         if not (is_path or os.path.isabs(text) or (self.given and _is_in(os.path.normpath(text), self.given))):
             return None
         then = os.path.normpath(os.path.join(self.directory, text))

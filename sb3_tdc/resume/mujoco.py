@@ -1,4 +1,4 @@
-"""MuJoCo's data, captured bit for bit. Imports MuJoCo only to restore what was captured of it."""
+"""Bit-exact capture of MuJoCo's data. MuJoCo is imported only when captured data are restored."""
 
 import hashlib
 from typing import Any
@@ -7,7 +7,7 @@ from sb3_tdc.resume.walk import Capture, NotCapturedError, NotRestoredError, Res
 
 
 def is_mujoco(name: str) -> Any:
-    """Return whether a value is one of MuJoCo's of this name."""
+    """Return a function that tells whether a value is of MuJoCo's class of this name."""
     return lambda value: type(value).__name__ == name and type(value).__module__.startswith("mujoco")
 
 
@@ -16,7 +16,7 @@ def _model_bytes(model: Any) -> bytes:
 
 
 def capture_mj_data(data: Any) -> dict[str, Any]:
-    """Capture MuJoCo's own bytes of the whole ``MjData``, without the model that it puts among them."""
+    """Capture the bytes to which MuJoCo serialises an ``MjData``, without the model that they contain."""
     whole, model = data.__getstate__(), _model_bytes(data.model)
     before, found, after = whole.partition(model)
     if not found:
@@ -25,7 +25,12 @@ def capture_mj_data(data: Any) -> dict[str, Any]:
 
 
 def restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
-    """Give an existing ``MjData`` its state, if it is of the same model; return it, or another with this state."""
+    """
+    Restore the state of an existing ``MjData`` of the same model.
+
+    :return: the existing ``MjData``, or a new one with this state if MuJoCo cannot copy into an existing one
+    :raises NotRestoredError: if the model differs from the captured one
+    """
     import mujoco
 
     model = _model_bytes(existing_as(mujoco.MjData, existing, "MjData").model)
@@ -33,14 +38,14 @@ def restore_mj_data(existing: Any, state: dict[str, Any]) -> Any:
         raise NotRestoredError("the environment has another MuJoCo model now, or has changed its model")
     source = mujoco.MjData.__new__(mujoco.MjData)
     source.__setstate__(state["before"] + model + state["after"])
-    if not hasattr(mujoco, "mj_copyData"):  # MuJoCo before 3.5 cannot copy into it from Python
+    if not hasattr(mujoco, "mj_copyData"):  # MuJoCo before 3.5 cannot copy into an existing one from Python
         return source
     mujoco.mj_copyData(existing, existing.model, source)
     return existing
 
 
 def capture_mj_model(context: Capture, model: Any, path: str) -> None:
-    """Note that views of it are not the run's."""
+    """Note the model as the owner of its memory, so that the numbers in views of it are not captured."""
     context.owners.append(model.body_mass.base)
 
 

@@ -1,4 +1,4 @@
-"""PyBullet's worlds, captured bit for bit in its own format. Imports PyBullet only to read what is there."""
+"""Bit-exact capture of PyBullet's worlds in its own format, through existing clients. PyBullet is not imported."""
 
 import tempfile
 from pathlib import Path
@@ -8,15 +8,16 @@ from sb3_tdc.resume.walk import MISSING, NotCapturedError, NotRestoredError
 
 
 def is_client(value: Any) -> bool:
-    """Return whether a value is a connection to a world."""
+    """Return whether a value is a client: a connection to a PyBullet world."""
     return type(value).__name__ == "BulletClient" and type(value).__module__.startswith("pybullet_utils")
 
 
 def capture_world(client: Any) -> dict[str, Any]:
     """
-    Capture positions, velocities, contacts with the impulses that the solver starts from; and what bodies there are.
+    Capture positions, velocities, contacts with the impulses that the solver starts from, and the list of bodies.
 
-    :raises NotCapturedError: if several bodies move: from PyBullet's file, contacts between them continue differently
+    :raises NotCapturedError: if PyBullet cannot save its world, or if several bodies move: after PyBullet's file is
+        loaded, contacts between them continue differently
     """
     moving = [n for n in range(client.getNumBodies()) if _moves(client, n)]
     if len(moving) > 1:
@@ -30,7 +31,12 @@ def capture_world(client: Any) -> dict[str, Any]:
 
 
 def restore_world(existing: Any, state: dict[str, Any]) -> Any:
-    """Give an existing world its state, if it has the same bodies; return its client."""
+    """
+    Restore the state of an existing world with the same bodies.
+
+    :return: the client of the world
+    :raises NotRestoredError: if there is no world, or if it has other bodies
+    """
     if existing is MISSING or not is_client(existing):
         raise NotRestoredError("there is no PyBullet world to be restored")
     if _bodies(existing) != state["bodies"]:
@@ -48,5 +54,5 @@ def _moves(client: Any, body: int) -> bool:
 
 
 def _bodies(client: Any) -> list[str]:
-    """Return the names of all bodies, in the order in which they were loaded, with their numbers of joints."""
+    """Return the names and numbers of joints of all bodies, in the order in which they were loaded."""
     return [f"{client.getBodyInfo(n)}, {client.getNumJoints(n)} joints" for n in range(client.getNumBodies())]

@@ -1,9 +1,9 @@
 """
-The replay buffer's rings in segments: a state writes the transitions added since the last one.
+Storage of the replay buffer's rings in segments: every state writes the transitions added since the last state.
 
-A segment holds consecutive slots of the ring. The ring is that of the segments in the order they were written; one
-whose slots have all been overwritten since is not needed any more. Observations keep the type that the buffer has. A
-next observation that equals the observation of the following slot, bit for bit, is not stored twice.
+A segment holds consecutive slots of the rings. Reading all segments in the order in which they were written fills the
+rings. A segment whose slots have all been overwritten since is no longer needed. Observations keep the buffer's dtype.
+A next observation that equals the observation of the following slot, bit for bit, is not stored twice.
 """
 
 import ast
@@ -19,9 +19,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_tdc.resume.kinds.table import KINDS
 from sb3_tdc.resume.walk import MISSING, Capture, Initial, Restore
 
-# Written to once, when a transition is added. Whatever else a buffer holds is captured whole
+# A slot of these is written once, when a transition is added. All other attributes of a buffer are captured whole
 _RINGS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_INFOS = "infos"  # of HER, objects
+_INFOS = "infos"  # HER's info dicts, which hold objects
 _INFOS_PATH = f"replay_buffer.{_INFOS}"
 # A slot's next observation may be the following slot's observation
 _NEXT, _CURRENT = "next_observations", "observations"
@@ -30,11 +30,11 @@ _NEXT, _CURRENT = "next_observations", "observations"
 @dataclass(frozen=True)
 class Segment:
     """
-    Slots of the replay buffer that are stored in one file.
+    Consecutive slots of the replay buffer that are stored in one file.
 
-    :param name: of its file
-    :param first: its first slot
-    :param length: slots, at least 1 and at most the ring's
+    :param name: name of the file
+    :param first: the first slot
+    :param length: number of slots, at least 1 and at most the size of the ring
     """
 
     name: str
@@ -43,7 +43,7 @@ class Segment:
 
 
 def rings(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
-    """Return the arrays (slots, environments, ...) by name; those of ``Dict`` observations by ``name/key``."""
+    """Return the rings (slots, environments, ...) by name; those of ``Dict`` observations by ``name/key``."""
     found = {}
     for name in _RINGS:
         value = vars(buffer).get(name)
@@ -53,7 +53,7 @@ def rings(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
 
 
 def other_attributes(buffer: ReplayBuffer) -> dict[str, Any]:
-    """Return what is not in the segments, without the environment and the device."""
+    """Return the attributes that are not in the segments, without the environment and the device."""
     return {name: value for name, value in vars(buffer).items() if name not in (*_RINGS, _INFOS, "env", "device")}
 
 
@@ -61,9 +61,10 @@ def new_segment(buffer: ReplayBuffer, name: str, first: int | None, added: int) 
     """
     Return the slots that have been written since the last segment.
 
-    :param first: the buffer's position at the end of the last segment; None if there is none
-    :param added: slots since then, as the timesteps say
-    :return: the slots to write: all of them if this is not what the buffer says; None if there are none
+    :param first: the buffer's position at the end of the last segment; None if there is no segment
+    :param added: number of slots written since then, according to the timesteps
+    :return: the segment to write; all filled slots if there is no last segment or if the buffer's position contradicts
+        ``added``; None if there are no slots to write
     """
     size = buffer.buffer_size
     if first is None or not 0 <= added <= size or (first + added) % size != buffer.pos:
@@ -72,7 +73,7 @@ def new_segment(buffer: ReplayBuffer, name: str, first: int | None, added: int) 
 
 
 def needed(segments: list[Segment], size: int) -> list[Segment]:
-    """Return the segments whose slots have not all been written again."""
+    """Return the segments whose slots have not all been overwritten by later segments."""
     kept: list[Segment] = []
     written = np.zeros(size, dtype=bool)
     for segment in reversed(segments):
@@ -92,9 +93,11 @@ def find_non_finite(buffer: ReplayBuffer, segment: Segment) -> list[str]:
 
 def capture_infos(buffer: ReplayBuffer, segment: Segment) -> tuple[np.ndarray, list[str]]:
     """
-    Capture HER's ``copy_info_dict``: the values that are made from their content alone, whatever there is on resume.
+    Capture the info dicts that HER stores (``copy_info_dict``).
 
-    :return: JSON text and its arrays in one array of bytes; a sentence for each value that is left out
+    Only values that can be restored from their content alone are captured, since no infos exist when a run is resumed.
+
+    :return: JSON text and its arrays in one array of bytes; and a sentence for each value that is left out
     """
     slots, infos = _slots(buffer, segment), vars(buffer).get(_INFOS)
     if infos is None or not any(info for row in infos[slots] for info in row):
@@ -115,7 +118,7 @@ def _what_comes_back(info: dict[Any, Any], left_out: list[str]) -> dict[Any, Any
     kept = {}
     for key, value in info.items():
         context = _capture()
-        if context.capture_optional([[{key: value}]], _INFOS_PATH) is MISSING:  # as deep as it will be
+        if context.capture_optional([[{key: value}]], _INFOS_PATH) is MISSING:  # nested as deep as in the segment
             left_out += [why.replace("[0][0]", "", 1) for why in context.left_out]
         else:
             kept[key] = value
@@ -123,15 +126,15 @@ def _what_comes_back(info: dict[Any, Any], left_out: list[str]) -> dict[Any, Any
 
 
 def _capture() -> Capture:
-    """Return a capture without initial objects: when a run is resumed, the ring is empty."""
+    """Return a capture without initial objects, since the ring is empty when a run is resumed."""
     return Capture(KINDS, initial=Initial({}, {}, {}))
 
 
 def write_segment(buffer: ReplayBuffer, segment: Segment, infos: np.ndarray) -> Callable[[Path], None]:
     """
-    Return what writes the file of a segment.
+    Return a function that writes the file of a segment.
 
-    :param infos: of :func:`capture_infos`
+    :param infos: the array of bytes from :func:`capture_infos`
     """
 
     def write(path: Path) -> None:
@@ -149,7 +152,7 @@ def write_segment(buffer: ReplayBuffer, segment: Segment, infos: np.ndarray) -> 
 
 
 def read_segments(buffer: ReplayBuffer, files: Iterator[tuple[Segment, Path]]) -> None:
-    """Fill the rings; whatever was in them is overwritten, slot by slot."""
+    """Fill the rings from the files of their segments; the slots of each segment are overwritten."""
     targets = rings(buffer)
     for segment, path in files:
         slots = _slots(buffer, segment)
@@ -165,18 +168,18 @@ def read_segments(buffer: ReplayBuffer, files: Iterator[tuple[Segment, Path]]) -
 
 
 def _slots(buffer: ReplayBuffer, segment: Segment) -> np.ndarray:
-    # With optimize_memory_usage the slot after the last transition holds its next observation
+    # With optimize_memory_usage, the slot after the last transition holds its next observation
     length = min(segment.length + int(buffer.optimize_memory_usage), buffer.buffer_size)
     return np.arange(segment.first, segment.first + length) % buffer.buffer_size
 
 
 def _take(ring: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    """Return slots of a ring: a view where they do not wrap around its end."""
+    """Return the slots of a ring, as a view if they do not wrap around its end."""
     return ring[slots[0] : slots[-1] + 1] if slots[0] <= slots[-1] else ring[slots]
 
 
 def _same_bits(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return (slots, environments), whether all bits of the rows are equal (−0 and 0 are not, NaN is itself)."""
+    """Return whether all bits of two rows are equal (−0 and 0 differ, NaN equals itself): (slots, environments)."""
     if a.size == 0:
         return np.zeros(a.shape[:2], dtype=bool)
     words = (x.view(f"u{x.itemsize}").reshape(*x.shape[:2], -1) for x in (a, b))
@@ -195,7 +198,7 @@ def _restore_infos(buffer: ReplayBuffer, slots: np.ndarray, stored: np.ndarray) 
 
 
 def _text_of(dtype: np.dtype) -> str:
-    """Return a type as numpy's files have it: ``dtype.str`` of a type with fields does not name them."""
+    """Return a dtype as the text in NumPy's files: ``dtype.str`` does not contain the names of fields."""
     return dtype.str if dtype.names is None else repr(np.lib.format.dtype_to_descr(dtype))
 
 

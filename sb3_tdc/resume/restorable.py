@@ -1,4 +1,4 @@
-"""The access of a run to environments in other processes."""
+"""Wrapper that gives a run access to environments in other processes."""
 
 import pickle
 from typing import Any
@@ -12,15 +12,15 @@ from sb3_tdc.resume.locations import Locations
 
 
 class Restorable(gym.Wrapper):
-    """Capture and restore an environment in another process: ``SubprocVecEnv`` calls these methods there."""
+    """Wrapper that captures and restores an environment in the process in which ``SubprocVecEnv`` runs it."""
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # a property in Wrapper, too
-        """Return the environment's spec, in short where it cannot be sent to another process: it may hold functions."""
+        """Return the environment's spec, shortened if it cannot be sent to another process: it may hold functions."""
         spec = self.env.spec
         try:
             pickle.dumps(spec)
-        except Exception:  # whatever an object raises that cannot be pickled
+        except Exception:  # pickling an object may raise anything
             assert spec is not None
             return EnvSpec(spec.id, reward_threshold=spec.reward_threshold, max_episode_steps=spec.max_episode_steps)
         return spec

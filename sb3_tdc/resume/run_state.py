@@ -1,4 +1,4 @@
-"""Everything that the rest of a run depends on: captured between two rollouts, restored before the first."""
+"""The state of a run, on which the rest of it depends: captured between two rollouts, restored before the first one."""
 
 import json
 import platform
@@ -29,7 +29,7 @@ from sb3_tdc.resume.locations import UNMOVED, Locations
 from sb3_tdc.resume.replay_file import other_attributes
 from sb3_tdc.resume.walk import MISSING, Capture, Initial, NotRestoredError, Restore, name_of
 
-# Of the process, of the call of learn(), or captured on their own
+# Attributes of the process or of the call of learn(), or captured separately
 _NOT_THE_RUN = {"env", "policy", "replay_buffer", "tensorboard_log", "verbose", "start_time", "_total_timesteps"}
 
 
@@ -37,11 +37,13 @@ def capture_state(
     model: OffPolicyAlgorithm, callback: BaseCallback, initial: Initial | None = None
 ) -> tuple[dict[str, Any], Capture]:
     """
-    Capture all but the weights and the transitions; what cannot be captured or restored is left out and noted.
+    Capture everything but the weights and the transitions.
+
+    Values that cannot be captured or restored are left out and noted.
 
     :param callback: the root of all callbacks
-    :param initial: of the capture of all this as it was built; None for that capture itself
-    :return: JSON, and the :class:`Capture` with its arrays
+    :param initial: the initial capture, of the objects as they were built; None if this is that capture
+    :return: the state as JSON, and the :class:`Capture` with its arrays
     """
     context = Capture(KINDS, _known(model), initial)
     parts: dict[str, Any] = {
@@ -71,11 +73,11 @@ def restore_state(
     changed: Sequence[str] = (),
 ) -> None:
     """
-    Restore everything but the weights and the rings of the replay buffer, which are there already.
+    Restore everything but the weights and the rings of the replay buffer, which have been restored before.
 
-    :param context: with the arrays; it notes what could not be restored, and why episodes have to be started again
-    :param changed: hyperparameters that stay as they are, out of those of :func:`changeable`
-    :raises NotRestoredError: if the callbacks are others than those captured
+    :param context: holds the arrays, and notes the values that are not restored and why episodes must start again
+    :param changed: hyperparameters that keep their present values, out of those of :func:`changeable`
+    :raises NotRestoredError: if the callbacks are not those that were captured
     """
     names = [name_of(type(each)) for each in callbacks_of(callback)]
     if names != parts["names of callbacks"]:
@@ -84,7 +86,7 @@ def restore_state(
         )
     _restore_values(model, callback, parts, context, changed)
     assert model.env is not None
-    if not context.has_restored(model.env.unwrapped):  # whatever has been of its wrappers
+    if not context.has_restored(model.env.unwrapped):  # whether or not its wrappers are restored
         context.restarted.append("env is not in the state, or does not fit it")
     restarted = [why for why in context.restarted if why.startswith("env")]
     model.start_time = time.time_ns() - int(parts["seconds"] * 1e9)
@@ -92,7 +94,7 @@ def restore_state(
         _restart_episodes(model)
     if isinstance(model, CheckedOffPolicyAlgorithm):
         model.prepare_to_continue()
-    _set_random_state(context.restore(parts["random"], MISSING, "random"))  # last: all of the above may draw
+    _set_random_state(context.restore(parts["random"], MISSING, "random"))  # last: all of the above may draw numbers
 
 
 def _restore_values(
@@ -127,10 +129,10 @@ def restoring(
 
 def verify(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[list[str], Initial]:
     """
-    Capture, restore into the same objects, capture again, compare. Files are left alone.
+    Capture the state, restore it into the same objects, capture it again, and compare. Files are not changed.
 
-    :return: sentences that begin with the path of what a resumed run would not have, and what later captures
-        are compared with
+    :return: a sentence for each value that a resumed run would not have, beginning with its path; and the initial
+        capture that later captures are compared with
     """
     parts, before = capture_state(model, callback)
     context = Restore(KINDS, before.arrays, _known(model), with_files=False)
@@ -143,7 +145,7 @@ def verify(model: OffPolicyAlgorithm, callback: BaseCallback) -> tuple[list[str]
 
 
 def _known(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """Return what is captured on its own, and may be referred to from anywhere."""
+    """Return the objects that are captured separately, by name; any other object may refer to them."""
     known: dict[str, Any] = {"model": model, "replay_buffer": model.replay_buffer}
     known |= {f"policy.{name}": module for name, module in model.policy.named_modules()}
     known |= {f"policy.{name}": parameter for name, parameter in model.policy.named_parameters()}
@@ -163,7 +165,7 @@ def _logger_attributes(model: OffPolicyAlgorithm) -> dict[str, Any]:
     if logger is None:  # before learn()
         return {}
     attributes = {name: value for name, value in vars(logger).items() if name not in ("dir", "level")}
-    # What is on a screen stays there, and a resumed run may have another screen, or none
+    # Output on a screen cannot be taken back, and a resumed run may have another screen, or none
     files = [each for each in logger.output_formats if not (isinstance(each, HumanOutputFormat) and not each.own_file)]
     return {**attributes, "output_formats": files}
 
@@ -175,7 +177,7 @@ def _buffer(model: OffPolicyAlgorithm) -> Any:
 
 # ---------------------------------------------------------------- hyperparameters that may change
 
-# Of every off-policy algorithm, and of SB3's own, which cannot declare theirs
+# Of every off-policy algorithm; and of SB3's own algorithms, which do not declare theirs in ``changeable``
 _CHANGEABLE = ("learning_rate", "gamma", "tau", "batch_size", "gradient_steps", "train_freq", "learning_starts")
 _CHANGEABLE_OF_SB3 = {TD3: ("policy_delay", "target_policy_noise", "target_noise_clip")}
 
@@ -191,7 +193,7 @@ def changeable(model: OffPolicyAlgorithm) -> dict[str, tuple[str, ...]]:
 
 
 def capture_weights(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """Return state dicts and tensors, as SB3 names them for its zips, and the matrices of gSDE."""
+    """Return the state dicts and tensors that SB3 saves in its zips, by the same names, and the matrices of gSDE."""
     state_dicts, tensors = model._get_torch_save_params()
     return {
         "state_dicts": {name: recursive_getattr(model, name).state_dict() for name in state_dicts},
@@ -201,7 +203,7 @@ def capture_weights(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def restore_weights(model: OffPolicyAlgorithm, weights: dict[str, Any]) -> None:
-    """Restore weights in place, so that optimizers and targets stay those of the parameters."""
+    """Restore weights in place, so that optimizers and targets still refer to the same parameters."""
     for name, state in weights["state_dicts"].items():
         recursive_getattr(model, name).load_state_dict(state)
     with th.no_grad():
@@ -212,7 +214,7 @@ def restore_weights(model: OffPolicyAlgorithm, weights: dict[str, Any]) -> None:
 
 
 def find_non_finite(model: OffPolicyAlgorithm) -> list[str]:
-    """Return the names of weights, moments of optimizers and running statistics that are NaN or infinite."""
+    """Return the names of the weights, optimizer moments and running statistics that are NaN or infinite."""
     broken = find_non_finite_weights(model)
     state_dicts, _ = model._get_torch_save_params()
     numbers: dict[str, Any] = {}
@@ -264,7 +266,7 @@ def _set_random_state(state: dict[str, Any]) -> None:
 
 
 def _restart_episodes(model: OffPolicyAlgorithm) -> None:
-    """End the episodes under way in the replay buffer, as if a time limit had been reached, and begin new ones."""
+    """End the unfinished episodes in the replay buffer, as if a time limit had been reached, and begin new ones."""
     assert model.env is not None
     buffer = _buffer(model)
     if buffer.size() > 0:
@@ -286,11 +288,11 @@ def _restart_episodes(model: OffPolicyAlgorithm) -> None:
         model._last_original_obs = model._vec_normalize_env.get_original_obs()
 
 
-# ---------------------------------------------------------------- where it ran, and what it is
+# ---------------------------------------------------------------- descriptions of the run and its platform
 
 
 def describe_run(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """Return what a state and the run that it is restored into must have in common."""
+    """Return the properties that a state and the run that it is restored into must have in common."""
     assert model.env is not None
     spec = model.env.get_attr("spec")[0]
     return {
@@ -307,7 +309,7 @@ def describe_run(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def describe_platform(model: OffPolicyAlgorithm) -> dict[str, str]:
-    """Return what the last bits of a result depend on."""
+    """Return the properties of the platform on which the last bits of a result depend."""
     return {
         **library_versions(),
         "threads of torch": str(th.get_num_threads()),
@@ -321,10 +323,10 @@ def callbacks_of(callback: BaseCallback) -> list[BaseCallback]:
     Find all callbacks.
 
     :param callback: the root of all callbacks
-    :return: it, and those that it holds, directly or in lists
+    :return: the root, and the callbacks that it holds, directly or in lists, at any depth
     """
     reached = [callback]
-    for callback in reached:  # grows
+    for callback in reached:  # grows in the loop
         if getattr(callback, "is_captured", True):
             values = [item for v in vars(callback).values() for item in (v if isinstance(v, list) else [v])]
             reached += [v for v in values if isinstance(v, BaseCallback) and not any(v is r for r in reached)]
@@ -336,7 +338,7 @@ def files_of_evaluations(callback: BaseCallback) -> list[Path]:
     Find the files that evaluations rewrite.
 
     :param callback: the root of all callbacks
-    :return: what every ``EvalCallback`` among them rewrites
+    :return: the best model and the log of every ``EvalCallback`` among the callbacks
     """
     found: list[Path] = []
     for evaluation in evaluations_of(callback):
@@ -349,9 +351,9 @@ def files_of_evaluations(callback: BaseCallback) -> list[Path]:
 
 def evaluations_of(callback: BaseCallback) -> list[EvalCallback]:
     """
-    Find the evaluations among all callbacks.
+    Find the callbacks that evaluate.
 
     :param callback: the root of all callbacks
-    :return: every ``EvalCallback`` among them
+    :return: every ``EvalCallback`` among the callbacks
     """
     return [each for each in callbacks_of(callback) if isinstance(each, EvalCallback)]

@@ -1,9 +1,9 @@
 """
-Directories that are there whole or not at all.
+Storage of states in folders that exist completely or not at all.
 
-``<folder>/step_000000010000/`` holds the files of one state and, written last, ``manifest``: their SHA-256, and
-those of the shared files in ``<folder>/replay/`` that it needs. Everything is written next to its place, synced, and
-renamed.
+``<folder>/step_000000010000/`` holds the files of one state. Its ``manifest``, written last, holds the SHA-256 of these
+files, and of the shared files in ``<folder>/replay/`` that the state needs. Every state and every shared file is
+written under another name next to its final place, synced, and renamed.
 """
 
 import hashlib
@@ -30,11 +30,11 @@ _STEP = re.compile(r"step_(\d{12,})")
 
 
 class BrokenStateError(ValueError):
-    """A state that is not as it was written; the message says which file."""
+    """A state that is damaged or incomplete; the message names the file."""
 
 
 class LockedError(ValueError):
-    """Another process writes to the folder."""
+    """The folder is locked by another process, or by a newer store of this process."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Stored:
     """
     One state on disk, verified.
 
-    :param step: its timestep
-    :param path: its folder
-    :param shared: SHA-256 of the shared files that it needs, by name
+    :param step: timestep of the state
+    :param path: folder of the state
+    :param shared: SHA-256 of the shared files that the state needs, by name
     """
 
     step: int
@@ -57,7 +57,7 @@ class Stored:
 
 
 def stored_steps(folder: Path) -> list[int]:
-    """Return timesteps of the states in a folder, intact or not, newest first."""
+    """Return the timesteps of all states in a folder, intact or not, newest first."""
     found = [_STEP.fullmatch(path.name) for path in folder.glob("step_*")]
     return sorted((int(match[1]) for match in found if match), reverse=True)
 
@@ -68,18 +68,20 @@ _OPEN: "WeakValueDictionary[Path, Store]" = WeakValueDictionary()
 
 class Store:
     """
-    The states of one run. In one process, the newest store of a folder has it: an older one finds it locked.
+    The states of one run on disk.
 
-    :param folder: made if it is missing
-    :param keep: how many of the newest stay
-    :param span: one more stays, which is at least this many steps older than the newest, and less than twice as many
-        as soon as there can be one; 0 for none
-    :raises LockedError: if another process writes there
+    Within a process, only the newest store of a folder can write to it; an older store finds the folder locked.
+
+    :param folder: folder of the states; created if it is missing
+    :param keep: number of the newest states to keep
+    :param span: also keep one state that is at least this many steps older than the newest, and, once the run is long
+        enough, less than twice as many; 0 for none
+    :raises LockedError: if another process writes to the folder
     """
 
     def __init__(self, folder: Path, keep: int, span: int):
         self.folder, self.keep, self.span = folder, keep, span
-        # Outside the folder: removing the states must not let a second process in
+        # Outside the folder, so that removing the states does not let a second process in
         self._lock_file = folder.with_name(f"{folder.name}.lock")
         self._lock: Any = None
         earlier = _OPEN.get(folder.resolve())
@@ -88,20 +90,20 @@ class Store:
         self.open_again()
 
     def close(self) -> None:
-        """Let others write there, until this one writes again."""
+        """Release the lock, so that others can write to the folder until this store writes again."""
         if self._lock is not None:
-            if self._owner == os.getpid():  # not a fork of it, which shares the lock
+            if self._owner == os.getpid():  # not in a forked process, which shares the lock
                 unlock(self._lock)
             self._lock.close()
             self._lock = None
 
     def open_again(self, shared: Iterable[str] = ()) -> bool:
         """
-        Make the folder, and take the lock, again if they have been removed, or the store has been closed.
+        Create the folder and take the lock, also if they have been removed or if the store has been closed.
 
         :param shared: names of shared files
-        :return: whether these are still there
-        :raises LockedError: if another process writes there by now, or a newer store of this one
+        :return: whether these shared files still exist
+        :raises LockedError: if another process, or a newer store of this process, now writes to the folder
         """
         (self.folder / _SHARED).mkdir(parents=True, exist_ok=True)
         if self._lock is None or not is_file_at(self._lock, self._lock_file):
@@ -119,8 +121,8 @@ class Store:
         """
         Verify and return the newest intact state.
 
-        :return: the newest intact state, or None if there is none at all; broken ones are named in a warning
-        :raises BrokenStateError: if there are some, and none is intact
+        :return: the newest intact state, or None if there are no states; warnings name the broken states after it
+        :raises BrokenStateError: if there are states, but none is intact
         """
         reasons = []
         for step in self.steps():
@@ -140,8 +142,8 @@ class Store:
         """
         Verify and return the state of a step.
 
-        :return: the state of a step
-        :raises ValueError: if there is none, or it is broken
+        :return: the state of the step
+        :raises ValueError: if there is no state of this step, or if it is broken
         """
         if step not in self.steps():
             there = ", ".join(f"{known:,}" for known in self.steps()) or "none"
@@ -179,7 +181,7 @@ class Store:
         Write a file that several states need.
 
         :return: the SHA-256 of the file
-        :raises OSError: if it cannot be written; nothing of it stays
+        :raises OSError: if the file cannot be written; no part of it stays
         """
         path = self.folder / _SHARED / name
         part = path.with_name(f".{name}")
@@ -194,11 +196,11 @@ class Store:
 
     def write(self, step: int, files: dict[str, Writer], shared: dict[str, str]) -> Stored:
         """
-        Write a state, whole or not at all.
+        Write a state completely or not at all.
 
-        :param files: what writes each file, by name
-        :param shared: SHA-256 of the shared files that it needs, by name
-        :raises OSError: if it cannot be written; nothing of it stays, and what was there stays
+        :param files: the function that writes each file, by the file's name
+        :param shared: SHA-256 of the shared files that the state needs, by name
+        :raises OSError: if the state cannot be written; no part of it stays, and the earlier states stay
         """
         path = self._path(step)
         part = path.with_name(f".{path.name}")
@@ -218,13 +220,17 @@ class Store:
         return Stored(step, path, shared)
 
     def remove_after(self, step: int) -> None:
-        """Remove the states beyond the one that was restored."""
+        """Remove the states after a step, which is that of the restored state."""
         for later in self.steps():
             if later > step:
                 self._remove(later)
 
     def remove_old(self) -> None:
-        """Keep the newest, an older one with the one that will take its place, and the shared files they need."""
+        """
+        Remove the states and the shared files that are no longer needed.
+
+        The newest states stay, together with an older one, the one that will take its place, and their shared files.
+        """
         kept = _kept(self.steps(), self.keep, self.span)
         for step in self.steps():
             if step not in kept:
@@ -243,14 +249,14 @@ class Store:
         """
         Remove all states.
 
-        :raises LockedError: if another process writes there by now, or a newer store of this one
+        :raises LockedError: if another process, or a newer store of this process, now writes to the folder
         """
         self.open_again()
         for step in self.steps()[::-1]:
             self._remove(step)
 
     def remove_all(self) -> None:
-        """Remove the folder, and let go of it."""
+        """Remove the folder and its lock file, and release the lock."""
         self.clear()
         shutil.rmtree(self.folder, ignore_errors=True)
         self._lock_file.unlink(missing_ok=True)
@@ -260,7 +266,7 @@ class Store:
         path = self._path(step)
         part = path.with_name(f".{path.name}")
         shutil.rmtree(part, ignore_errors=True)
-        os.replace(path, part)  # at once: what is half removed must not be taken for a broken one
+        os.replace(path, part)  # atomically: a half-removed state must not be taken for a broken one
         shutil.rmtree(part, ignore_errors=True)
 
     def _path(self, step: int) -> Path:
@@ -271,7 +277,8 @@ def _kept(steps: list[int], keep: int, span: int) -> list[int]:
     """
     Choose the states that stay.
 
-    :param steps: newest first
+    :param steps: timesteps of all states, newest first
+    :return: timesteps of the states that stay
     """
     older = steps[: keep - 1 : -1]  # oldest first
     while len(older) > 1 and steps[0] - older[1] >= span:
@@ -295,7 +302,7 @@ def _sha256(path: Path) -> str:
 
 
 def _sync_folder(path: Path) -> None:
-    if os.name == "nt":  # a folder cannot be opened there
+    if os.name == "nt":  # Windows cannot open a folder
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:

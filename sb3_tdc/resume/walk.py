@@ -1,11 +1,11 @@
 """
-The state of Python objects as JSON and arrays, and back into objects that are there already. Nothing is pickled.
+Conversion of the state of Python objects to JSON and arrays, and back into existing objects. Nothing is pickled.
 
-``capture`` walks an object graph; ``restore`` walks the same graph, built again, and gives it the values. What can hold
-a state that Python does not see (a native object, a lock, a socket) is refused by its path: an object is captured
-whole, or not at all. Some values are made from what was captured alone; others have to be there already (an object of
-a class, a function). :func:`uncovered` says which of these were not there when training began, and so will not be when
-the run is resumed.
+``capture`` walks an object graph; ``restore`` walks the same graph, built again, and gives it the captured values. A
+value that may have a state invisible to Python (a native object, a lock, a socket) is refused, by an error that names
+its path: an object is captured completely or not at all. Some values are created from their captured content alone;
+others (an object of a class, a function) must already exist. :func:`uncovered` names those that did not exist when
+training began, and so will not exist when the run is resumed.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from torch import nn
 from sb3_tdc.resume.locations import UNMOVED, Locations
 
 MISSING: Any = object()
-# Deeper nesting could be captured, but not restored within Python's limit of recursion
+# Deeper nesting could be captured, but not restored within Python's recursion limit
 _DEEPEST = 100
 
 
@@ -37,7 +37,7 @@ class NotRestoredError(ValueError):
 
 
 def is_scalar(value: Any) -> bool:
-    """Return whether JSON gives a value back as it was."""
+    """Return whether a value is unchanged after a round trip through JSON."""
     if type(value) is int:
         return abs(value) < 1 << 63
     if type(value) is str:
@@ -57,11 +57,11 @@ def head(node: dict[str, Any]) -> tuple[str, Any]:
 @dataclass(frozen=True)
 class Initial:
     """
-    What was there when training began.
+    The objects that existed when training began, as they were captured then.
 
-    :param attributes: what was captured of those that can be left out, by path
-    :param shared: the arrays that were parts of the same memory, each group as one text: how they are reached
-    :param texts: all texts by path, since some of them are locations
+    :param attributes: the captured attributes, of those that may be left out, by path
+    :param shared: the paths of each group of arrays that shared memory, by a text that says how they are reached
+    :param texts: all texts by path, since some of them are locations of files
     """
 
     attributes: dict[str, Any]
@@ -71,11 +71,11 @@ class Initial:
 
 class Capture:
     """
-    One walk through object graphs that may share objects.
+    One capture: a walk through object graphs that may share objects.
 
-    :param kinds: how each kind of value is captured, in the order in which they are tried
+    :param kinds: the kinds of values, in the order in which they are tried
     :param known: objects that are captured elsewhere, by name
-    :param initial: of the capture of the objects as they were built; None for that capture itself
+    :param initial: the initial capture, of the objects as they were built; None if this is that capture
     """
 
     def __init__(self, kinds: "Kinds", known: dict[str, Any] | None = None, initial: Initial | None = None):
@@ -83,25 +83,25 @@ class Capture:
         self.arrays: list[np.ndarray] = []
         self.left_out: list[str] = []
         self.attributes: dict[str, Any] = {}
-        self.texts: dict[str, str] = {}  # those that the objects were built with
-        self.first_arrays: dict[str, int] = {}  # of attributes that are captured separately
-        self.shared_elsewhere: dict[str, str] = {}  # memory, in such captures
-        self.owners: list[Any] = []  # of memory that is captured with an object: arrays in it need no numbers
+        self.texts: dict[str, str] = {}  # by path: those that the objects were built with
+        self.first_arrays: dict[str, int] = {}  # by path: the first array of an attribute captured separately
+        self.shared_elsewhere: dict[str, str] = {}  # the memory shared within separate captures
+        self.owners: list[Any] = []  # of native memory that is not captured again with arrays that view it
         self.initial = initial
         self._known = {id(value): name for name, value in (known or {}).items()}
         self._seen: dict[int, int] = {}
         self._alive: list[Any] = []
         self._memory: dict[int, int] = {}
         self._new_memory = itertools.count()
-        self._parts: list[tuple[int, str, str]] = []  # the memory of every array, its path, and how it is reached
-        self._trail: list[str] = []  # the classes of the values under way
+        self._parts: list[tuple[int, str, str]] = []  # of every array: its memory, its path, and how it is reached
+        self._trail: list[str] = []  # the classes of the values that are being captured
 
     def capture(self, value: Any, path: str) -> Any:
         """
         Capture a value.
 
-        :return: JSON
-        :raises NotCapturedError: for what cannot be captured
+        :return: the value as JSON
+        :raises NotCapturedError: if the value, or a part of it, cannot be captured
         """
         if is_scalar(value):
             if type(value) is str and self.initial is None:
@@ -131,7 +131,7 @@ class Capture:
         """
         Capture values by name.
 
-        :param optional: leave out, and note, what cannot be captured or will not be restored
+        :param optional: leave out, and note, values that cannot be captured or will not be restored
         """
         if not optional:
             return {name: self.capture(value, f"{path}.{name}") for name, value in values.items()}
@@ -143,14 +143,14 @@ class Capture:
         return captured
 
     def capture_optional(self, value: Any, path: str) -> Any:
-        """Return JSON, or MISSING for what cannot be captured or will not be restored."""
+        """Return a value as JSON, or note it and return MISSING if it cannot be captured or will not be restored."""
         mark = self.mark()
         try:
             node = self.capture(value, path)
             if self.initial is not None:
                 for why in uncovered(self.kinds, node, self.initial.attributes.get(path), path):
                     raise NotCapturedError(why)
-        except OSError:  # a full disk
+        except OSError:  # for instance a full disk: the whole state cannot be written
             raise
         except Exception as error:
             is_named = isinstance(error, NotCapturedError)
@@ -161,11 +161,11 @@ class Capture:
         return node
 
     def mark(self) -> Any:
-        """Return what :meth:`return_to` takes."""
+        """Return a mark of the present position, for :meth:`return_to`."""
         return [len(each) for each in self._lists()], dict(self._seen), dict(self.attributes)
 
     def return_to(self, mark: Any) -> None:
-        """Forget what has been captured since: it will not be in the state, nor may it be referred to."""
+        """Discard the values captured since a mark: they will not be in the state, and nothing may refer to them."""
         lengths, self._seen, self.attributes = mark
         for each, length in zip(self._lists(), lengths, strict=True):
             del each[length:]
@@ -174,7 +174,7 @@ class Capture:
         return self.arrays, self._parts, self.owners
 
     def add_array(self, array: np.ndarray) -> dict[str, int]:
-        """Return what stands for it in JSON."""
+        """Add an array, and return the JSON that refers to it."""
         self.arrays.append(array)
         return {"#": len(self.arrays) - 1}
 
@@ -182,8 +182,9 @@ class Capture:
         """
         Note the memory that an array is a part of.
 
-        :param part: which part of the memory it is, and of which shape and type
-        :param address: where the memory begins that an array is a part of; None if it has no numbers
+        :param address: the address at which the memory begins; None if the array is empty
+        :param path: the path of the array
+        :param part: which part of the memory the array is, and its shape and dtype
         :return: the number of this memory
         """
         new = next(self._new_memory)
@@ -192,17 +193,17 @@ class Capture:
         return number
 
     def as_initial(self) -> Initial:
-        """Return what later captures are compared with."""
+        """Return this capture as the initial one, with which later captures are compared."""
         return Initial(self.attributes, self.shared_memory(), self.texts)
 
     def tell_shared_memory(self) -> None:
-        """Note what shares its memory and did not when training began: it will not when the run is resumed."""
+        """Note arrays that share memory, but did not when training began: they will not when the run is resumed."""
         if self.initial is not None:
             new = [paths for group, paths in self.shared_memory().items() if group not in self.initial.shared]
             self.left_out += [f"{paths} share their memory, and did not so when training began" for paths in new]
 
     def shared_memory(self) -> dict[str, str]:
-        """Return the paths of arrays that are parts of the same memory, by how they are reached."""
+        """Return the paths of each group of arrays that share memory, by how they are reached."""
         groups: dict[int, list[tuple[str, str]]] = {}
         for number, path, way in self._parts:
             groups.setdefault(number, []).append((way, path))
@@ -214,14 +215,14 @@ class Capture:
 
 class Restore:
     """
-    The walk back.
+    The reverse of a :class:`Capture`: a walk that restores the captured values into object graphs.
 
-    :param kinds: of the :class:`Capture`
-    :param arrays: of the :class:`Capture`
-    :param known: as there
+    :param kinds: the kinds of values, as in the :class:`Capture`
+    :param arrays: the arrays of the :class:`Capture`
+    :param known: objects that are restored elsewhere, by the names in the :class:`Capture`
     :param step: the timestep of the capture
-    :param with_files: restore files too
-    :param locations: where the run's files were, and are now
+    :param with_files: restore files, too
+    :param locations: where the run's files were, and where they are now
     """
 
     def __init__(
@@ -239,7 +240,7 @@ class Restore:
         self.not_restored: list[str] = []
         self._arrays = arrays
         self._seen: dict[int, Any] = {}
-        self._numbers: list[int | None] = []  # of the values under way
+        self._numbers: list[int | None] = []  # ids of the values that are being restored
         self._claimed: dict[int, Any] = {}
         self._whole: dict[int, Any] = {}
         self._memory: dict[int, int] = {}
@@ -248,10 +249,10 @@ class Restore:
         """
         Restore a value.
 
-        :param node: what was captured
-        :param existing: what is there now; it becomes the value where it can, for all that refer to it
-        :return: the value
-        :raises NotRestoredError: if it does not fit
+        :param node: the captured value, as JSON
+        :param existing: the object in its place now; it becomes the value if possible, for all objects that refer to it
+        :return: the restored value
+        :raises NotRestoredError: if the captured value does not fit the objects that exist now
         """
         if not isinstance(node, dict):
             node = self.locations.find(node, existing, path) if type(node) is str else node
@@ -267,16 +268,16 @@ class Restore:
         value = self.kinds[tag].restore(self, content, existing, path)
         self.begin(value)
         self._numbers.pop()
-        self._whole[id(value)] = value  # alive, so that its id stays its own
+        self._whole[id(value)] = value  # kept alive, so that no other object gets its id
         return value
 
     def has_restored(self, value: Any) -> bool:
-        """Return whether an object has got back all of its state."""
+        """Return whether an object has been restored."""
         return id(value) in self._whole
 
     @contextmanager
     def names(self) -> Iterator[None]:
-        """Restore texts that are looked up: keys of dictionaries, columns of logs."""
+        """Restore the texts in this block as names, not as relative paths: keys of dictionaries, columns of logs."""
         locations, self.locations = self.locations, self.locations.of_names()
         try:
             yield
@@ -284,19 +285,19 @@ class Restore:
             self.locations = locations
 
     def begin(self, value: Any) -> None:
-        """Register a value before its contents are restored: they may refer to it."""
+        """Register a value before its contents are restored, since they may refer to it."""
         if self._numbers[-1] is not None:
             self._seen[self._numbers[-1]] = value
 
     def claims(self, existing: Any) -> bool:
-        """Return whether an existing object may become a value: not if it has become another value already."""
+        """Claim an existing object for a captured value; return whether it exists and has not been claimed before."""
         is_free = existing is not MISSING and id(existing) not in self._claimed
         if is_free:
-            self._claimed[id(existing)] = existing  # alive, as above
+            self._claimed[id(existing)] = existing  # kept alive, as above
         return is_free
 
     def claims_memory(self, memory: int, there: int) -> bool:
-        """Return whether existing memory may become that of captured arrays: not if it has become another already."""
+        """Claim existing memory for captured memory; return whether no other captured memory has claimed it before."""
         return self._memory.setdefault(there, memory) == memory
 
     def restore_attributes(self, nodes: dict[str, Any], owner: Any, path: str, optional: bool = False) -> None:
@@ -314,7 +315,7 @@ class Restore:
 
     @contextmanager
     def optional(self, path: str) -> Iterator[None]:
-        """Leave what cannot be restored in this block as it is, and note it."""
+        """Note an error in this block instead of raising it: the value that cannot be restored stays as it is."""
         depth = len(self._numbers)
         try:
             yield
@@ -324,7 +325,7 @@ class Restore:
             self.not_restored.append(str(error) if is_named else f"{path} ({type(error).__name__}: {error})")
 
     def array(self, content: dict[str, int]) -> np.ndarray:
-        """Return the array that a content stands for, to be copied."""
+        """Return the array that a content refers to; callers copy it."""
         return self._arrays[content["#"]]
 
 
@@ -337,9 +338,12 @@ class Kind:
     """
     How one kind of value is captured and restored.
 
-    :param needs: what has to be there to restore a content, as a text; None if it is made from the content alone
-    :param children: the values inside a content, by the rest of their paths
-    :param has_identity: whether it matters if two of these are one
+    :param matches: returns whether a value is of this kind
+    :param capture: returns the content of a value, as JSON
+    :param restore: returns the value, from its content and the existing value
+    :param has_identity: whether it matters that two references are to the same value
+    :param needs: returns what must exist to restore a content, as a text; None if the content alone is enough
+    :param children: returns the values inside a content, by the rest of their paths
     """
 
     def __init__(
@@ -365,8 +369,8 @@ def plain(
     """
     Return a kind whose state is a dict of plain values.
 
-    :param restore: takes the existing value (MISSING if it has become another one) and this dict, returns the value
-    :param owner: takes the value, returns what arrays have as their base that are views of its memory
+    :param restore: returns the value, from the existing value (MISSING if it has been claimed before) and this dict
+    :param owner: returns the object that is the base of all arrays that are views of a value's memory
     """
 
     def capture_content(context: Capture, value: Any, path: str) -> Any:
@@ -383,11 +387,11 @@ def plain(
 
 def uncovered(kinds: "Kinds", node: Any, initial: Any, path: str) -> Iterator[str]:
     """
-    Yield what of a captured value cannot be restored into the objects that were there when training began.
+    Yield the parts of a captured value that cannot be restored into the objects that existed when training began.
 
-    :param node: the value
-    :param initial: what was captured at that time in its place
-    :return: sentences that begin with a path
+    :param node: the captured value
+    :param initial: the value in its place in the initial capture
+    :return: a sentence for each part, beginning with its path
     """
     if not isinstance(node, dict) or head(node)[0] in ("known", "same"):
         return
@@ -405,9 +409,9 @@ def uncovered(kinds: "Kinds", node: Any, initial: Any, path: str) -> Iterator[st
 
 def existing_as(kind: Any, existing: Any, path: str) -> Any:
     """
-    Check the class of an existing object.
+    Check the class of an existing object, and return the object.
 
-    :raises NotRestoredError: unless the existing object is of the class
+    :raises NotRestoredError: if the object does not exist, or is not of the class
     """
     if not isinstance(existing, kind):
         found = "nothing" if existing is MISSING else f"a {name_of(type(existing))}"
@@ -415,7 +419,7 @@ def existing_as(kind: Any, existing: Any, path: str) -> Any:
     return existing
 
 
-# By tag, in the order in which they are tried: the first that matches counts
+# By tag, in the order in which they are tried: the first kind that matches is used
 Kinds = Mapping[str, Kind]
 
 
@@ -424,7 +428,7 @@ def name_of(kind: Any) -> str:
     return f"{getattr(kind, '__module__', '')}.{getattr(kind, '__qualname__', kind)}"
 
 
-# Attributes that are set by SB3 when training begins, or are whose state is captured elsewhere
+# Attributes that SB3 sets when training begins, or whose state is captured elsewhere
 _SKIPPED: dict[type, set[str]] = {
     BaseCallback: {"model", "locals", "globals", "parent"},
     VecEnvWrapper: {"class_attributes"},
@@ -434,7 +438,7 @@ _SKIPPED: dict[type, set[str]] = {
 
 
 def attributes_of(value: Any) -> dict[str, Any]:
-    """Return all attributes of an object, those in slots too, by name."""
+    """Return the attributes of an object by name, including those in slots."""
     skipped = {name for kind, names in _SKIPPED.items() if isinstance(value, kind) for name in names}
     slots = [name for c in type(value).__mro__ for name, v in vars(c).items() if is_slot(v)]
     attributes = {name: getattr(value, name) for name in slots if hasattr(value, name)}
@@ -443,5 +447,5 @@ def attributes_of(value: Any) -> dict[str, Any]:
 
 
 def is_slot(value: Any) -> bool:
-    """Return whether an attribute of a class is a slot of its objects."""
+    """Return whether an attribute of a class is a slot of its instances."""
     return isinstance(value, types.MemberDescriptorType)

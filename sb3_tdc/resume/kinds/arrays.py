@@ -1,4 +1,4 @@
-"""Arrays, tensors and the values that JSON does not know; an existing array keeps its memory."""
+"""Kinds for arrays, tensors, and values that JSON cannot represent. An existing array keeps its memory."""
 
 import datetime
 import decimal
@@ -20,7 +20,7 @@ from sb3_tdc.resume.walk import MISSING, Capture, NotCapturedError, NotRestoredE
 
 
 def run_lengths(array: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return starts and values of the runs of equal numbers, where that is much smaller; else None."""
+    """Return the starts and values of runs of equal numbers, or None if they are not much smaller than the array."""
     if array.dtype.kind not in "biu" or array.size <= 4096:
         return None
     flat = array.ravel()
@@ -29,7 +29,7 @@ def run_lengths(array: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def capture_array(context: Capture, value: np.ndarray, path: str) -> Any:
-    """Return the numbers, and which part of which memory they are."""
+    """Return the numbers of an array, and which part of which memory it is."""
     if value.dtype.kind == "O":
         return {"shape": list(value.shape), "items": capture_items(context, list(value.flat), path)}
     if value.dtype.hasobject:
@@ -46,7 +46,7 @@ def capture_array(context: Capture, value: np.ndarray, path: str) -> Any:
 
 
 def restore_array(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill an array, in place where one of the same part of its memory is there."""
+    """Restore an array, in place if the existing array is the same part of its memory."""
     if "items" in content:
         return _restore_objects(context, content, existing, path)
     if "native" in content:
@@ -61,7 +61,7 @@ def restore_array(context: Restore, content: Any, existing: Any, path: str) -> A
         return existing
     if "native" not in content:
         return value
-    # A new array would be a view no more
+    # A new array would no longer be a view of the native memory
     if existing.dtype != value.dtype or existing.tobytes() != value.tobytes():
         raise NotRestoredError(f"{path} is a view of native memory that cannot be written to")
     return existing
@@ -76,7 +76,7 @@ def _numbers(context: Restore, content: Any) -> np.ndarray:
 
 
 def needs_of_array(content: Any) -> str | None:
-    """Return the shape of an array in native memory, which has to be there."""
+    """Return a description of an array in native memory, which must exist; None for any other array."""
     return f"a view of native memory, of shape {content['native']}" if "native" in content else None
 
 
@@ -103,7 +103,7 @@ def _fits(existing: Any, value: np.ndarray, content: Any) -> bool:
 
 
 def is_native_memory(array: np.ndarray) -> bool:
-    """Return whether the memory may belong to a native object that continues writing to it, as MuJoCo's does."""
+    """Return whether the memory may belong to a native object that writes to it, as MuJoCo's does."""
     return type(_root(array).base).__name__ == "PyCapsule"
 
 
@@ -114,7 +114,7 @@ def _root(array: np.ndarray) -> np.ndarray:
 
 
 def _address(array: np.ndarray) -> int:
-    """Return where the memory begins: that of the object it belongs to, if this tells."""
+    """Return the address of an array's memory: of its owner's whole buffer, if the owner exposes it."""
     whole = _root(array)
     with suppress(TypeError, ValueError, BufferError):
         whole = np.frombuffer(whole.base, dtype=np.uint8)  # type: ignore[arg-type]
@@ -122,14 +122,14 @@ def _address(array: np.ndarray) -> int:
 
 
 def _part(array: np.ndarray) -> list[Any] | None:
-    """Return None for the whole of a memory, else where in it, and how."""
+    """Return the offset (bytes) and strides of an array in its memory; None if it owns the memory."""
     if array.base is None:
         return None
     return [array.__array_interface__["data"][0] - _address(array), list(array.strides)]
 
 
 def _memory_of(context: Capture, array: Any, path: str) -> int:
-    """Return the number of the memory in this capture."""
+    """Note the memory of an array or a tensor, and return its number in this capture."""
     is_tensor = isinstance(array, th.Tensor)
     size = array.numel() if is_tensor else array.size
     address = array.untyped_storage().data_ptr() if is_tensor else _address(array)
@@ -141,12 +141,12 @@ def _memory_of(context: Capture, array: Any, path: str) -> int:
 
 
 def is_tensor(value: Any) -> bool:
-    """Return whether it is a tensor, or a parameter, and not of a class derived from these."""
+    """Return whether a value is a tensor or a parameter, but not of a derived class."""
     return type(value) in (th.Tensor, nn.Parameter)
 
 
 def capture_tensor(context: Capture, value: th.Tensor, path: str) -> Any:
-    """Return the numbers, the gradient, the device."""
+    """Return the numbers, the gradient and the device of a tensor."""
     if value.grad_fn is not None or vars(value):
         raise NotCapturedError(f"{path} is a tensor with {'attributes' if vars(value) else 'a history of gradients'}")
     try:
@@ -164,7 +164,7 @@ def capture_tensor(context: Capture, value: th.Tensor, path: str) -> Any:
 
 
 def restore_tensor(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill a tensor, in place where one of this shape and type is there."""
+    """Restore a tensor, in place if the existing tensor has its shape and dtype."""
     value = th.from_numpy(context.array(content["array"]).copy())
     kind = nn.Parameter if content["parameter"] else th.Tensor
     fits = type(existing) is kind and existing.shape == value.shape and existing.dtype == value.dtype
@@ -184,17 +184,17 @@ def restore_tensor(context: Restore, content: Any, existing: Any, path: str) -> 
 
 
 def capture_number(context: Capture, value: Any, path: str) -> Any:
-    """Return numpy's scalar as an array."""
+    """Return a NumPy scalar as an array."""
     array = np.array(value)
     if array.dtype.hasobject or type(array[()]) is not type(value) or array.tobytes() != np.asarray(value).tobytes():
         raise NotCapturedError(f"{path} is a {type(value).__name__} of {array.dtype}")
-    if array.dtype.kind in "US" and array[()] != value:  # numpy drops the zeros at the end
+    if array.dtype.kind in "US" and array[()] != value:  # NumPy drops trailing null characters
         raise NotCapturedError(f"{path} is a text that numpy does not keep whole")
     return context.add_array(array)
 
 
 def capture_bytes(context: Capture, value: Any, path: str) -> Any:
-    """Return an array of the bytes."""
+    """Return bytes as an array."""
     return context.add_array(np.frombuffer(bytes(value), dtype=np.uint8))
 
 
@@ -204,7 +204,7 @@ def restore_bytes(context: Restore, content: Any, existing: Any, path: str) -> A
 
 
 def restore_bytearray(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill an array of bytes, in place where there is one."""
+    """Restore a bytearray, in place if there is one."""
     value = existing if type(existing) is bytearray and context.claims(existing) else bytearray()
     value[:] = context.array(content).tobytes()
     return value
@@ -217,7 +217,7 @@ def _torch_type(name: str) -> th.dtype:
     return found
 
 
-# Immutable values by name: their class, what they are made from, and how
+# Immutable values by name: their class, how to get the parts they are made from, and how to make them
 _MADE: dict[str, tuple[type, Callable[[Any], list[Any]], Callable[..., Any]]] = {
     "complex": (complex, lambda v: [v.real, v.imag], complex),
     "range": (range, lambda v: [v.start, v.stop, v.step], range),
@@ -239,7 +239,7 @@ _MADE: dict[str, tuple[type, Callable[[Any], list[Any]], Callable[..., Any]]] = 
 
 
 def is_made(value: Any) -> bool:
-    """Return whether a value can be made from a few others."""
+    """Return whether a value can be made from a few simpler values."""
     return _row(value) is not None
 
 
@@ -249,7 +249,7 @@ def _row(value: Any) -> str | None:
 
 
 def capture_made(context: Capture, value: Any, path: str) -> Any:
-    """Return the name of the kind, and what it is made from."""
+    """Return the name of a value's kind, and the parts that the value is made from."""
     name = _row(value)
     assert name is not None
     _, parts, make = _MADE[name]
@@ -260,7 +260,7 @@ def capture_made(context: Capture, value: Any, path: str) -> Any:
 
 
 def restore_made(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Return the value."""
+    """Make a value from its parts."""
     name, parts = content
     if issubclass(_MADE[name][0], pathlib.Path):
         text = context.restore(parts[0], MISSING, path)

@@ -1,4 +1,4 @@
-"""Lists, tuples, dictionaries, sets: made again, or filled in place where one is there, so that it stays shared."""
+"""Kinds for lists, tuples, dictionaries, sets, deques: existing mutable ones are filled in place, and stay shared."""
 
 import json
 from collections import Counter, OrderedDict, defaultdict, deque
@@ -7,11 +7,11 @@ from typing import Any
 from sb3_tdc.resume.kinds.objects import is_made_in_python, loaded_class
 from sb3_tdc.resume.walk import MISSING, Capture, NotCapturedError, NotRestoredError, Restore, head, name_of
 
-# Longer lists of numbers are kept as arrays
+# Longer lists of numbers are stored as arrays
 _LONG = 64
-# Dictionaries that can be made from their name
+# Classes of dictionaries that can be created from their name
 _DICTS = {name_of(kind): kind for kind in (dict, OrderedDict, Counter, defaultdict)}
-# Kinds of values that are equal whenever they were captured equal: these can be keys, and members of sets
+# Kinds of values that stay equal when they are captured and restored: these can be keys, and members of sets
 _VALUES = {"value", "integer", "text", "bytes", "number", "enum", "code", "same", "known"}
 _TUPLES = {"tuple", "frozenset", "named tuple"}
 
@@ -22,7 +22,7 @@ def items_of(content: list[Any]) -> dict[str, Any]:
 
 
 def capture_items(context: Capture, value: Any, path: str) -> list[Any]:
-    """Return the content of a list."""
+    """Capture the items of a list or another sequence."""
     return [context.capture(item, f"{path}[{i}]") for i, item in enumerate(value)]
 
 
@@ -30,7 +30,7 @@ def restore_items(context: Restore, content: list[Any], there: list[Any], path: 
     """
     Restore the items of a list or tuple.
 
-    :param there: what is in the same places now
+    :param there: the items in the same places now
     """
     there = there + [MISSING] * (len(content) - len(there))
     return [
@@ -39,7 +39,7 @@ def restore_items(context: Restore, content: list[Any], there: list[Any], path: 
 
 
 def restore_list(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill a list, in place where there is one."""
+    """Restore a list, in place if there is one."""
     there = list(existing) if type(existing) is list else []
     value = existing if type(existing) is list and context.claims(existing) else []
     context.begin(value)
@@ -48,7 +48,7 @@ def restore_list(context: Restore, content: Any, existing: Any, path: str) -> An
 
 
 def is_long_list_of_numbers(value: Any) -> bool:
-    """Return whether a list can be kept as an array."""
+    """Return whether a value is a list that can be stored as an array."""
     if type(value) is not list or len(value) <= _LONG:
         return False
     kinds = {type(item) for item in value}
@@ -56,7 +56,7 @@ def is_long_list_of_numbers(value: Any) -> bool:
 
 
 def restore_numbers(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill a list, in place where there is one."""
+    """Restore a list of numbers, in place if there is one."""
     value = existing if type(existing) is list and context.claims(existing) else []
     value[:] = context.array(content).tolist()
     return value
@@ -71,7 +71,7 @@ def restore_tuple(context: Restore, content: Any, existing: Any, path: str) -> A
 
 
 def is_named_tuple(value: Any) -> bool:
-    """Return whether it is of a class made by ``namedtuple``, or by ``NamedTuple``."""
+    """Return whether a value is of a class made by ``namedtuple`` or ``NamedTuple``."""
     return isinstance(value, tuple) and type(value).__bases__ == (tuple,) and hasattr(type(value), "_fields")
 
 
@@ -91,7 +91,7 @@ def restore_named_tuple(context: Restore, content: Any, existing: Any, path: str
 
 
 def needs_of_named_tuple(content: Any) -> str | None:
-    """Return the class, if it is in no module."""
+    """Return the class if it is not found in an imported module, and so must already exist; else None."""
     return None if loaded_class(content[0], tuple) else f"a {content[0]}"
 
 
@@ -99,13 +99,13 @@ def needs_of_named_tuple(content: Any) -> str | None:
 
 
 def is_dict(value: Any) -> bool:
-    """Return whether it is a dictionary of a class that is known, or was made in Python."""
+    """Return whether a value is a dictionary of a known class, or of one made in Python."""
     known = (*_DICTS.values(), object)
     return isinstance(value, dict) and all(c in known or is_made_in_python(c) for c in type(value).__mro__)
 
 
 def capture_dict(context: Capture, value: dict[Any, Any], path: str) -> Any:
-    """Return the class, the items, the attributes, and the factory of missing items."""
+    """Return the class, the items, the attributes, and the default factory of a dictionary."""
     items = []
     for key, item in dict.items(value):
         node = context.capture(key, f"{path} (a key)")
@@ -121,7 +121,7 @@ def capture_dict(context: Capture, value: dict[Any, Any], path: str) -> Any:
 
 
 def restore_dict(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill a dictionary, in place where there is one."""
+    """Restore a dictionary, in place if there is one."""
     name = content["class"]
     is_there = name_of(type(existing)) == name
     there: dict[Any, Any] = dict(dict.items(existing)) if is_there else {}
@@ -137,7 +137,7 @@ def restore_dict(context: Restore, content: Any, existing: Any, path: str) -> An
         with context.names():
             key = context.restore(key_node, MISSING, path)
         items.append((key, context.restore(node, there.get(key, MISSING), f"{path}[{key!r}]")))
-    kind = OrderedDict if isinstance(value, OrderedDict) else dict  # not what a class makes of its methods
+    kind = OrderedDict if isinstance(value, OrderedDict) else dict  # not the methods that a subclass overrides
     kind.clear(value)
     for key, item in items:
         kind.__setitem__(value, key, item)
@@ -149,21 +149,21 @@ def restore_dict(context: Restore, content: Any, existing: Any, path: str) -> An
 
 
 def needs_of_dict(content: Any) -> str | None:
-    """Return the class, where it cannot be made from its name."""
+    """Return the class if it cannot be created from its name; else None."""
     return None if content["class"] in _DICTS else f"a {content['class']}"
 
 
 def children_of_dict(content: Any) -> dict[str, Any]:
-    """Return items, attributes, factory."""
+    """Return the items, the attributes, and the default factory of a dictionary."""
     children = {f"[{json.dumps(key)}]": node for key, node in content["items"]}
     children |= {f".{name}": node for name, node in content.get("attributes", {}).items()}
     return {**children, ".default_factory": content.get("factory")}
 
 
 def _is_value(context: Capture, node: Any, value: Any) -> bool:
-    """Return whether it will be found under this key."""
+    """Return whether a key or a member of a set will be found by its value after it is restored."""
     if not isinstance(node, dict):
-        return value == value  # no NaN
+        return value == value  # false for NaN
     tag, content = head(node)
     if tag not in ("same", "known") and context.kinds[tag].needs(content) is not None:
         return False
@@ -189,7 +189,7 @@ def _describe(value: Any) -> str:
 
 
 def capture_set(context: Capture, value: Any, path: str) -> Any:
-    """Return the members, in an order that does not depend on the process."""
+    """Return the members of a set, in an order that does not depend on the process."""
     members = sorted(value, key=repr)
     nodes = capture_items(context, members, path)
     for node, member in zip(nodes, members, strict=True):
@@ -199,7 +199,7 @@ def capture_set(context: Capture, value: Any, path: str) -> Any:
 
 
 def restore_set(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill a set, in place where there is one."""
+    """Restore a set, in place if there is one."""
     value = existing if type(existing) is set and context.claims(existing) else set()
     members = restore_items(context, content, [], path)
     value.clear()
@@ -208,12 +208,12 @@ def restore_set(context: Restore, content: Any, existing: Any, path: str) -> Any
 
 
 def capture_deque(context: Capture, value: Any, path: str) -> Any:
-    """Return the largest length, and the items."""
+    """Return the maximum length and the items of a deque."""
     return [value.maxlen, capture_items(context, value, path)]
 
 
 def restore_deque(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Fill a deque, in place where there is one of this length."""
+    """Restore a deque, in place if there is one with this maximum length."""
     maxlen, items = content
     there = list(existing) if type(existing) is deque else []
     is_there = type(existing) is deque and existing.maxlen == maxlen

@@ -1,4 +1,4 @@
-"""Generators of random numbers, and files that rows are added to."""
+"""Kinds for random number generators, and for text files to which rows are added."""
 
 import io
 import os
@@ -16,13 +16,13 @@ GENERATORS = (np.random.Generator, np.random.RandomState, random.Random, th.Gene
 
 
 def capture_generator(value: np.random.Generator) -> dict[str, Any]:
-    """Return the state of a generator, and how many others it has spawned."""
+    """Return the state of a generator, and the number of generators that it has spawned."""
     spawned = getattr(value.bit_generator.seed_seq, "n_children_spawned", 0)
     return {"state": value.bit_generator.state, "spawned": spawned}
 
 
 def restore_generator(existing: Any, state: dict[str, Any]) -> np.random.Generator:
-    """Return the existing one, if it is of the same kind."""
+    """Restore the existing generator if its bit generator is of the same kind, else a new one."""
     name = state["state"]["bit_generator"]
     if name not in _BIT_GENERATORS:
         raise NotRestoredError(f"There is no bit generator {name}")
@@ -36,7 +36,7 @@ def restore_generator(existing: Any, state: dict[str, Any]) -> np.random.Generat
 
 
 def restore_random_state(existing: Any, state: dict[str, Any]) -> np.random.RandomState:
-    """Return the existing one, or a new one."""
+    """Restore the existing generator, or a new one."""
     existing = existing if type(existing) is np.random.RandomState else np.random.RandomState()
     existing.set_state(state["state"])
     return existing
@@ -49,7 +49,7 @@ def capture_python_random(value: random.Random) -> dict[str, Any]:
 
 
 def restore_python_random(existing: Any, state: dict[str, Any]) -> random.Random:
-    """Return the existing one, or a new one."""
+    """Restore the existing generator, or a new one."""
     existing = existing if type(existing) is random.Random else random.Random()
     version, words, gauss = state["state"]
     existing.setstate((version, tuple(words), gauss))
@@ -57,7 +57,7 @@ def restore_python_random(existing: Any, state: dict[str, Any]) -> random.Random
 
 
 def restore_torch_generator(existing: Any, state: dict[str, Any]) -> th.Generator:
-    """Return the existing one, or a new one."""
+    """Restore the existing generator, or a new one."""
     existing = existing if isinstance(existing, th.Generator) else th.Generator()
     existing.set_state(th.from_numpy(state["state"]))
     return existing
@@ -67,20 +67,20 @@ def restore_torch_generator(existing: Any, state: dict[str, Any]) -> th.Generato
 
 
 def is_written_file(value: Any) -> bool:
-    """Return whether it is a text file that is open for writing."""
+    """Return whether a value is a text file that is open for writing."""
     is_open = type(value) is io.TextIOWrapper and not value.closed and value.writable()
     return is_open and isinstance(value.name, str) and Path(value.name).is_file()
 
 
 def capture_text_file(context: Any, file: Any, path: str) -> Any:
-    """Return all that was written."""
+    """Return the content of a file."""
     file.flush()
     os.fsync(file.fileno())
     return context.add_array(np.frombuffer(Path(file.name).read_bytes(), dtype=np.uint8))
 
 
 def restore_text_file(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Cut a file to what it was."""
+    """Rewrite an open file with its captured content."""
     file = existing_as(io.TextIOWrapper, None if existing is MISSING else existing, path)
     if context.with_files:
         file.flush()

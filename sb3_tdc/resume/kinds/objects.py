@@ -1,4 +1,4 @@
-"""Code, objects of Python classes, optimizers: they have to be there already, and get back what they held."""
+"""Kinds for code, objects of Python classes, and optimizers: they must already exist, and get back their state."""
 
 import enum
 import functools
@@ -27,17 +27,17 @@ from sb3_tdc.resume.walk import (
     name_of,
 )
 
-# Code: nothing to capture; it is compared by name when it is restored
+# Code has no state to capture; it is compared by name when it is restored
 _CODE: tuple[type, ...] = (type, types.BuiltinFunctionType, types.ModuleType, property, types.GenericAlias, np.ufunc)
 _CODE += (types.MethodDescriptorType, types.WrapperDescriptorType, types.ClassMethodDescriptorType, type(np.mean))
-# What draws, or writes rows to a file that is captured itself
+# Renderers, and writers of rows to a file that is captured itself
 _WITHOUT_STATE = ("gymnasium.envs.mujoco.mujoco_rendering.", "pygame.", "_csv.")
-# Simulators that are reached by a number or a proxy: the Python objects that use them look as if they could be captured
+# Simulators that objects reach by a number or a proxy: these Python objects only look as if they could be captured
 _NATIVE_PACKAGES = {"pybullet", "pybullet_data", "pybullet_utils", "Box2D", "ale_py", "isaacgym"}
 _NATIVE_PACKAGES |= {"isaaclab", "isaaclab_rl", "isaacsim", "omni", "warp"}
-# Packages whose classes reach their simulator through an object that is captured (a BulletClient) alone
+# Packages whose classes reach their simulator only through an object that is captured (a BulletClient)
 _REACHED_BY_OBJECTS = {"pybullet_envs_gymnasium"}
-# Classes that may come to be where there was another, or nothing
+# Classes that can be restored even if another class, or nothing, is in their place
 _BUILTIN: dict[str, type] = {
     name_of(kind): kind
     for kind in (*(bool, int, float, str, bytes, list, tuple, dict, set, frozenset), deque, Counter, OrderedDict)
@@ -47,10 +47,11 @@ _BUILTIN[name_of(defaultdict)] = defaultdict
 
 def loaded_class(name: str, base: type) -> type | None:
     """
-    Look for a class in the modules that are imported already; nothing is imported.
+    Find a class in the modules that are already imported; no module is imported.
 
-    :param name: of :func:`name_of`
-    :param base: what it has to be derived from
+    :param name: the name of the class, from :func:`name_of`
+    :param base: the class that it must be derived from
+    :return: the class, or None if it is not found
     """
     parts = name.split(".")
     for i in range(len(parts) - 1, 0, -1):
@@ -66,7 +67,7 @@ def loaded_class(name: str, base: type) -> type | None:
 
 
 def code_name(value: Any) -> str:
-    """Return what a class, a function, a module or the like is called."""
+    """Return the name of a class, a function, a module or a similar value."""
     if isinstance(value, (types.ModuleType, np.ufunc)):
         return f"{type(value).__name__} {value.__name__}"
     if isinstance(value, types.GenericAlias):
@@ -79,9 +80,9 @@ def code_name(value: Any) -> str:
 
 
 def is_code(value: Any) -> bool:
-    """Return whether it has no state, and is known by its name."""
+    """Return whether a value has no state, and is identified by its name."""
     if isinstance(value, types.BuiltinMethodType) and not isinstance(value.__self__, types.ModuleType | type | None):
-        return False  # of an instance: it has a state
+        return False  # bound to an instance, which has a state
     if isinstance(value, types.FunctionType):
         module = sys.modules.get(value.__module__)
         return getattr(module, "__dict__", {}).get(value.__qualname__) is value
@@ -90,7 +91,7 @@ def is_code(value: Any) -> bool:
 
 
 def restore_code(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Return the existing value, if it has this name."""
+    """Return the existing value if it has this name, or the built-in class of this name."""
     if existing is not MISSING and code_name(existing) == content:
         return existing
     if content not in _BUILTIN:
@@ -100,17 +101,17 @@ def restore_code(context: Restore, content: Any, existing: Any, path: str) -> An
 
 
 def needs_of_code(content: Any) -> str | None:
-    """Return the name of a class, function or module."""
+    """Return the name of a class, function or module that must exist; None for a built-in class."""
     return None if content in _BUILTIN else content
 
 
 def is_constant(value: Any) -> bool:
-    """Return whether a value is only compared when a run is resumed."""
+    """Return whether a value is only compared, not restored, when a run is resumed."""
     return isinstance(value, EnvSpec)
 
 
 def describe_constant(value: Any) -> str:
-    """Return the id of a constant, and a digest of its text without addresses in memory."""
+    """Return the id of a constant, and a digest of its ``repr`` without memory addresses."""
     text = re.sub(r" at 0x[0-9a-f]+", "", repr(value))
     return f"the EnvSpec of {value.id} ({hashlib.sha256(text.encode()).hexdigest()[:8]})"
 
@@ -126,7 +127,7 @@ def restore_constant(context: Restore, content: Any, existing: Any, path: str) -
 
 
 def capture_function(context: Capture, value: types.FunctionType, path: str) -> Any:
-    """Return name, digest and enclosed values of a function."""
+    """Return the name, digest, enclosed values, defaults and attributes of a function."""
     cells = dict(zip(value.__code__.co_freevars, value.__closure__ or (), strict=True))
     return {
         "name": f"{code_name(value)} {_digest(value.__code__)}",
@@ -138,7 +139,7 @@ def capture_function(context: Capture, value: types.FunctionType, path: str) -> 
 
 
 def restore_function(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Put back what a function encloses."""
+    """Restore the enclosed values, defaults and attributes of an existing function."""
     there = existing_as(types.FunctionType, existing, path)
     if f"{code_name(there)} {_digest(there.__code__)}" != content["name"]:
         raise NotRestoredError(f"{path} was {content['name']}, and is {code_name(there)} of other code")
@@ -172,7 +173,7 @@ def _is_full(cell: Any) -> bool:
 
 
 def _digest(code: types.CodeType) -> str:
-    """Return a digest of what a function does, not of where it is written, which any change of its file moves."""
+    """Return a digest of a function's code, without its line numbers, which change with any edit of its file."""
     parts = [code.co_code.hex(), *map(repr, (code.co_names, code.co_varnames, code.co_freevars, code.co_argcount))]
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -185,12 +186,12 @@ def _digest(code: types.CodeType) -> str:
 
 
 def capture_method(context: Capture, value: types.MethodType, path: str) -> Any:
-    """Return name and object of a method."""
+    """Return the name and the object of a method."""
     return [code_name(value), context.capture(value.__self__, f"{path}.__self__")]
 
 
 def restore_method(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Return the existing method, of the object that it was of."""
+    """Return the existing method, bound to its restored object."""
     name, owner = content
     existing = existing_as(types.MethodType, existing, path)
     if code_name(existing) != name:
@@ -200,14 +201,14 @@ def restore_method(context: Restore, content: Any, existing: Any, path: str) -> 
 
 
 def capture_partial(context: Capture, value: Any, path: str) -> Any:
-    """Return function and arguments of a partial."""
+    """Return the function and the arguments of a ``functools.partial``."""
     if vars(value):
         raise NotCapturedError(f"{path} is a functools.partial with attributes")
     return [context.capture(part, path) for part in (value.func, value.args, value.keywords)]
 
 
 def restore_partial(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Return the existing one, or a new one."""
+    """Restore an existing ``functools.partial``, or make a new one."""
     is_there = type(existing) is functools.partial
     there = [existing.func, existing.args, existing.keywords] if is_there else [MISSING] * 3
     func, args, keywords = (context.restore(node, part, path) for node, part in zip(content, there, strict=True))
@@ -221,12 +222,12 @@ def restore_partial(context: Restore, content: Any, existing: Any, path: str) ->
 
 
 def is_member(value: Any) -> bool:
-    """Return whether it is a member of an enumeration, that has a name."""
+    """Return whether a value is a member of an enumeration that has a name."""
     return isinstance(value, enum.Enum) and value.name in type(value).__members__
 
 
 def restore_member(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Return the member."""
+    """Return the member of an enumeration, by its name."""
     name, member = content
     kind: Any = type(existing) if name_of(type(existing)) == name else loaded_class(name, enum.Enum)
     if kind is None or member not in kind.__members__:
@@ -235,17 +236,17 @@ def restore_member(context: Restore, content: Any, existing: Any, path: str) -> 
 
 
 def needs_of_member(content: Any) -> str | None:
-    """Return the class, if it is in no module."""
+    """Return the class if it is not found in an imported module, and so must already exist; else None."""
     return None if loaded_class(content[0], enum.Enum) else f"a {content[0]}"
 
 
 # ---------------------------------------------------------------- objects
 
-_MADE_AT_RUN_TIME = 1 << 9  # Py_TPFLAGS_HEAPTYPE: by a class statement, or by C that imitates one
+_MADE_AT_RUN_TIME = 1 << 9  # Py_TPFLAGS_HEAPTYPE: made by a class statement, or by C code that imitates one
 
 
 def is_made_in_python(kind: type) -> bool:
-    """Return whether a class has no state but in the attributes of its objects."""
+    """Return whether a class keeps the state of its objects in their attributes only."""
     return bool(kind.__flags__ & _MADE_AT_RUN_TIME) and isinstance(vars(kind).get("__new__"), staticmethod | None)
 
 
@@ -254,7 +255,7 @@ def is_python_object(value: Any) -> bool:
     classes = type(value).__mro__[:-1]
     slots = sum(is_slot(v) for kind in classes for v in vars(kind).values())
     has_attributes = hasattr(value, "__dict__") or any("__slots__" in vars(kind) for kind in classes)
-    # The head of an object, its __dict__, its weak references, its slots: native objects are larger
+    # The object header, __dict__, the weak references, and the slots; native objects are larger
     is_small = type(value).__basicsize__ <= object.__basicsize__ + 8 * (2 + slots)
     return all(map(is_made_in_python, classes)) and has_attributes and is_small
 
@@ -275,12 +276,12 @@ def uses_native_package(kind: type) -> str | None:
 
 
 def _is_of_parts(value: Any) -> bool:
-    """Return whether attributes can continue without another one: statistics, without the environments below."""
+    """Return whether each attribute can be restored without the others: statistics without the environments below."""
     return isinstance(value, (BaseCallback, VecEnvWrapper))
 
 
 def capture_object(context: Capture, value: Any, path: str) -> Any:
-    """Return class and attributes."""
+    """Return the class and the attributes of an object."""
     kind = type(value)
     if package := uses_native_package(kind):
         raise NotCapturedError(f"{path} is a {name_of(kind)}, which uses {package}")
@@ -290,7 +291,7 @@ def capture_object(context: Capture, value: Any, path: str) -> Any:
 
 
 def restore_object(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Give an existing object its attributes."""
+    """Restore the attributes of an existing object."""
     name, nodes = content
     claim(context, name, existing, path)
     context.begin(existing)
@@ -302,24 +303,24 @@ def restore_object(context: Restore, content: Any, existing: Any, path: str) -> 
 
 
 def needs_of_object(content: Any) -> str | None:
-    """Return the class of an object."""
+    """Return the class of an object, which must exist."""
     return f"a {content[0]}"
 
 
 def attributes_in(content: Any) -> dict[str, Any]:
-    """Return the children of an object."""
+    """Return the attributes of an object, as its children."""
     return {f".{name}": node for name, node in content[-1].items()}
 
 
 def capture_optimizer(context: Capture, value: th.optim.Optimizer, path: str) -> Any:
-    """Return class, state, and attributes; what is kept by parameter, by their number."""
+    """Return the class, state and attributes of an optimizer; per-parameter state is keyed by parameter number."""
     others = {name: v for name, v in vars(value).items() if name not in ("state", "param_groups")}
     state = context.capture(value.state_dict(), f"{path}.state")
     return [name_of(type(value)), state, context.capture_attributes(others, path)]
 
 
 def restore_optimizer(context: Restore, content: Any, existing: Any, path: str) -> Any:
-    """Give an existing optimizer its moments."""
+    """Restore the state and the attributes of an existing optimizer."""
     name, state, others = content
     claim(context, name, existing, path)
     context.begin(existing)
@@ -330,10 +331,10 @@ def restore_optimizer(context: Restore, content: Any, existing: Any, path: str) 
 
 def claim(context: Restore, name: str, existing: Any, path: str) -> None:
     """
-    Take an existing object as one that was captured.
+    Claim an existing object for a captured object of the same class.
 
-    :param name: of its class
-    :raises NotRestoredError: unless it is of this class, and has not been taken before
+    :param name: the name of the captured object's class
+    :raises NotRestoredError: if there is no object of this class, or if it has been claimed before
     """
     if existing is MISSING or name_of(type(existing)) != name:
         found = "nothing" if existing is MISSING else f"a {name_of(type(existing))}"

@@ -1,4 +1,4 @@
-"""The table of all kinds of values, in the order in which they are tried. Each states its class exactly."""
+"""Table of all kinds of values, in the order in which they are tried. Most match one class, without its subclasses."""
 
 import functools
 import random
@@ -164,7 +164,7 @@ KINDS: Kinds = {
         needs=lambda content: "MuJoCo's MjData",
         owner=lambda data: data.xpos.base,
     ),
-    # Part of the MjData of every environment that has one; the two are compared there
+    # Not captured itself: an environment with a model also has an MjData, which includes and compares a digest of it
     "MjModel": Kind(
         mujoco.is_mujoco("MjModel"),
         mujoco.capture_mj_model,
