@@ -1,4 +1,4 @@
-"""Scores over tasks: which algorithms have runs of one length on the same tasks, and how they compare there."""
+"""Scores over tasks: which algorithms have runs of the same length on the same tasks, and how they compare."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from sb3_tdc.experiments.groups import Conditions, Group, as_shipped, by_conditi
 @dataclass(frozen=True)
 class Aggregate:
     """
-    Algorithms as ``hyperparams/`` has them, on tasks on which each has at least two finished seeds.
+    Algorithms with the hyperparameters of ``hyperparams/``, on tasks on which each has at least two finished seeds.
 
-    :param length: of their runs
-    :param physics: of their tasks, "" where MuJoCo's version does not matter
+    :param length: of the runs: a number of steps, or a share of the steps in ``hyperparams/``
+    :param physics: MuJoCo version of the tasks, "" where it does not matter
     :param env_ids: the tasks
     :param groups: for every algorithm, its group on each task
-    :param left_out: other algorithms and tasks of this length
+    :param left_out: the other algorithms and tasks that have runs of this length
     """
 
     length: str
@@ -30,7 +30,7 @@ class Aggregate:
 
     @property
     def scores(self) -> dict[str, list[np.ndarray]]:
-        """For every algorithm and task (runs,): 0 and 1 are the lowest and the highest single run on the task."""
+        """For every algorithm, its scores on each task, (runs,): 0 and 1 are the lowest and highest run on the task."""
         scores: dict[str, list[np.ndarray]] = {label: [] for label in self.groups}
         for task in range(len(self.env_ids)):
             final = {label: groups[task].final_returns for label, groups in self.groups.items()}
@@ -43,7 +43,7 @@ class Aggregate:
         return {(label, group.conditions) for label, groups in self.groups.items() for group in groups}
 
     def intervals(self) -> list[tuple[float, float, float]]:
-        """Return the interquartile mean of every algorithm, and its 95 % stratified bootstrap interval."""
+        """Return the interquartile mean of every algorithm, with its 95 % stratified bootstrap interval."""
         return [
             (float(statistics.interquartile_mean(*tasks)), *statistics.iqm_interval(tasks))
             for tasks in self.scores.values()
@@ -51,7 +51,7 @@ class Aggregate:
 
 
 def aggregate(groups: Sequence[Group]) -> list[Aggregate]:
-    """Return what can be averaged over tasks: at least two algorithms on at least two tasks, at one length."""
+    """Return the sets of at least two algorithms on at least two tasks, of one length, to be averaged over tasks."""
     found: list[Aggregate] = []
     for (length, physics), tasks in _at_one_length(groups).items():
         one = _score(length, physics, tasks)
@@ -61,16 +61,16 @@ def aggregate(groups: Sequence[Group]) -> list[Aggregate]:
 
 
 def describe_share(share: float) -> str:
-    """Return how long a run is, compared with the number of steps in ``hyperparams/``."""
+    """Describe the length of a run as a share of the steps in ``hyperparams/``."""
     return "all steps of hyperparams/" if share == 1 else f"{100 * share:.3g} % of the steps in hyperparams/"
 
 
 def choose(tasks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """
-    Choose at least two algorithms that share at least two tasks: those with the most runs in common.
+    Choose at least two algorithms that share at least two tasks, with the most pairs of algorithm and task.
 
-    :param tasks: of every algorithm
-    :return: the algorithms and the tasks that all of them have, in the order given; empty if there are none
+    :param tasks: for every algorithm, its tasks
+    :return: the algorithms, and the tasks that all of them share, in the order given; empty if there are none
     """
     best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
     for n in range(len(tasks), 1, -1):
@@ -82,7 +82,11 @@ def choose(tasks: Mapping[str, Sequence[str]]) -> tuple[tuple[str, ...], tuple[s
 
 
 def _at_one_length(groups: Sequence[Group]) -> dict[tuple[str, str], dict[str, dict[str, Group]]]:
-    """Return, by length and physics, the group of every algorithm and task. Lengths are numbers of steps and shares."""
+    """
+    Return the group of every algorithm and task, by length and physics.
+
+    A group is listed by its number of steps, and again by its share of the steps in ``hyperparams/``, if any.
+    """
     found: dict[tuple[str, str], dict[str, dict[str, Group]]] = {}
     for conditions, alike in by_conditions(group for group in groups if group.finished).items():
         for group in as_shipped(alike):

@@ -1,8 +1,8 @@
 """
-The paper's claims, each against the runs that are there: what is compared, on which numbers, and the verdict.
+The paper's claims, each examined on the available runs: what is compared, with which numbers, and the verdict.
 
 A verdict needs 95 % intervals over seeds that do not overlap; anything else is undecided. One seed decides nothing.
-A claim is examined on the tasks that the paper makes it for.
+A claim is examined only on the tasks for which the paper makes it.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,8 +16,8 @@ from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import MUJOCO, PYBULLET
 
 BASELINES = ("td3", "sac", "meow", "ddpg")
-# The χ² interval is of normal values. Where some seeds leave a plateau and others do not, three seeds of one and the
-# same law would be told apart in a fifth of all cases, and ten in a hundredth
+# The χ² interval assumes normal values. Where some seeds leave a plateau and others do not, two groups drawn from the
+# same distribution would be told apart in a fifth of all cases with three seeds each, and in a hundredth with ten
 MIN_SEEDS_OF_SPREAD = 10
 # Two returns are the same, or comparable, if they differ by at most this share of the larger mean
 _SAME = 0.1
@@ -28,9 +28,9 @@ _LARGE_LAM = 0.75
 @dataclass(frozen=True)
 class Interval:
     """
-    A number with its 95 % interval over seeds; NaN if there are fewer than two.
+    A number with its 95 % interval over seeds, which is NaN for fewer than two seeds.
 
-    :param n: seeds
+    :param n: the number of seeds
     """
 
     value: float
@@ -49,13 +49,14 @@ class Interval:
 @dataclass(frozen=True)
 class Claim:
     """
-    One comparison.
+    One comparison that a claim of the paper requires.
 
-    :param says: what the paper claims
-    :param group: of our side; both are of the same conditions
-    :param what: the quantity that is compared
-    :param ours: of the side that the claim favours
-    :param other: of the other side
+    :param says: the claim
+    :param group: the group on our side; both sides have the same conditions
+    :param what: the compared quantity
+    :param sides: names of our group and of the other
+    :param ours: the quantity for our group, the one that the claim favours
+    :param other: the quantity for the other group
     """
 
     says: str
@@ -68,7 +69,7 @@ class Claim:
 
 
 def judge(ours: Interval, other: Interval) -> str:
-    """Return the verdict on the claim that ours is the larger one."""
+    """Return the verdict on the claim that ours is larger."""
     if not (ours.is_known and other.is_known):
         return "undecided: too few seeds"
     if ours.is_above(other):
@@ -77,19 +78,19 @@ def judge(ours: Interval, other: Interval) -> str:
 
 
 def judge_smaller(ours: Interval, other: Interval) -> str:
-    """Return the verdict on the claim that ours is the smaller one."""
+    """Return the verdict on the claim that ours is smaller."""
     return judge(other, ours)
 
 
 def judge_spread(ours: Interval, other: Interval) -> str:
-    """Return the verdict on the claim that ours is the smaller spread."""
+    """Return the verdict on the claim that ours is the smaller spread; it needs ``MIN_SEEDS_OF_SPREAD`` seeds."""
     if min(ours.n, other.n) < MIN_SEEDS_OF_SPREAD:
         return "undecided: too few seeds"
     return judge_smaller(ours, other)
 
 
 def judge_at_least(ours: Interval, other: Interval) -> str:
-    """Return the verdict on the claim that ours is the larger one, or less than a tenth smaller."""
+    """Return the verdict on the claim that ours is larger, or smaller by at most a tenth of the larger mean."""
     if not (ours.is_known and other.is_known):
         return "undecided: too few seeds"
     if ours.low >= other.high - _margin(ours, other):
@@ -98,7 +99,7 @@ def judge_at_least(ours: Interval, other: Interval) -> str:
 
 
 def judge_same(ours: Interval, other: Interval) -> str:
-    """Return the verdict on the claim that both are the same, within a tenth of the larger mean."""
+    """Return the verdict on the claim that both are equal, within a tenth of the larger mean."""
     if not (ours.is_known and other.is_known):
         return "undecided: too few seeds"
     margin = _margin(ours, other)
@@ -115,29 +116,29 @@ def _margin(ours: Interval, other: Interval) -> float:
 
 
 def late_return(group: Group) -> Interval:
-    """Return the mean over seeds of the evaluations in the last third, with Student's interval."""
+    """Return the mean over seeds of the evaluations in the last third of a run, with Student's t interval."""
     return _mean(group.late_returns)
 
 
 def spread_of_seeds(group: Group) -> Interval:
-    """Return the standard deviation of late returns over seeds, with the χ² interval of normal values."""
+    """Return the standard deviation of late returns over seeds, with the χ² interval for normal values."""
     values = group.late_returns
     low, high = statistics.spread_interval(values)
     return Interval(statistics.spread(values), low, high, len(values))
 
 
 def late_spread(group: Group) -> Interval:
-    """Return how much the evaluations of one run scatter late in training, mean over seeds."""
+    """Return the scatter of a run's evaluations late in training, as the mean over seeds."""
     return _mean([_scatter_of_late_evaluations(run) for run in group.finished])
 
 
 def late_td_error_variance(group: Group) -> Interval:
-    """Return log10 of the variance of TD errors late in training, mean over seeds."""
+    """Return log10 of the variance of TD errors late in training, as the mean over seeds."""
     return _mean([_log_of_late_td_errors(run) for run in group.finished])
 
 
 def _scatter_of_late_evaluations(run: Run) -> float:
-    """Return the standard deviation about a straight line: a run that still improves does not scatter for that."""
+    """Return the standard deviation about a straight line, so that steady improvement does not count as scatter."""
     late = run.late_evaluations()
     if len(late) < 3:
         return float("nan")
@@ -170,7 +171,7 @@ _LATE_SPREAD: Quantity = ("scatter of a run's evaluations in its last third, abo
 _TD_ERRORS: Quantity = ("log10 of the variance of TD errors in the last third", late_td_error_variance)
 
 _INTERCHANGEABLE = "4. The heads are interchangeable"
-# Ours is the stochastic head
+# The claim and the verdict for each task; "ours" is the stochastic head
 _HEADS: dict[str, tuple[str, Verdict]] = {
     "HalfCheetah-v4": (_INTERCHANGEABLE, judge_same),
     "Humanoid-v4": (_INTERCHANGEABLE, judge_same),
@@ -181,7 +182,7 @@ _HEADS: dict[str, tuple[str, Verdict]] = {
 
 
 def examine(groups: Sequence[Group]) -> list[Claim]:
-    """Compare what there is for each claim, in the order of the claims, under all conditions."""
+    """Return the comparisons that the groups allow for each claim, in the order of the claims, under all conditions."""
     claims = (_returns, _variances, _lambdas, _heads, _td_errors)
     under_conditions = by_conditions((g for g in groups if g.finished), (*MUJOCO, *PYBULLET)).values()
     return [compared for claim in claims for alike in under_conditions for compared in claim(alike)]
@@ -195,7 +196,7 @@ def _returns(groups: Sequence[Group]) -> Iterator[Claim]:
 def _variances(groups: Sequence[Group]) -> Iterator[Claim]:
     for plain, baseline in _baselines(groups):
         yield _claim("2. λ-LCB varies less", _SEEDS, plain, baseline, judge_spread)
-        # More episodes an evaluation, or more evaluations, and their scatter is another one
+        # The scatter depends on the interval between evaluations and on the episodes in each
         if all(plain.setting(key) == baseline.setting(key) for key in ("eval_freq", "eval_episodes")):
             yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, baseline, judge_smaller)
 
@@ -221,7 +222,7 @@ def _td_errors(groups: Sequence[Group]) -> Iterator[Claim]:
 
 
 def _baselines(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
-    """Yield pairs of TDC and a baseline on a task of the paper, both as ``hyperparams/`` has them."""
+    """Yield pairs of TDC and a baseline on a task of the paper, both with the hyperparameters of ``hyperparams/``."""
     shipped = [group for group in as_shipped(groups) if group.env_id in (*MUJOCO, *PYBULLET)]
     for plain in (group for group in shipped if group.algo == "tdc"):
         for baseline in (group for group in shipped if group.algo in BASELINES):
@@ -229,7 +230,7 @@ def _baselines(groups: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
 
 
 def _ablations(groups: Sequence[Group], key: str, *env_ids: str) -> list[list[Group]]:
-    """Yield TDC as ``hyperparams/`` has it, but for one setting: ordered by it."""
+    """Return lists of TDC groups that differ from ``hyperparams/`` in one setting at most, ordered by that setting."""
     return vary(
         (g for g in groups if g.algo == "tdc" and g.env_id in env_ids and is_as_shipped(g.runs[0], but={key})), key
     )

@@ -1,4 +1,4 @@
-"""Runs → curves of figures: binned evaluations and diagnostics, for every seed."""
+"""Runs → the curves of figures: binned evaluations and diagnostics of every seed."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -15,10 +15,10 @@ _BIN = 20_000  # environment steps, at the paper's scale
 
 def headline(groups: Sequence[Group]) -> list[Group]:
     """
-    Choose what a figure on algorithms shows, of groups under the same conditions.
+    Choose the groups that a figure of algorithms shows, among groups under the same conditions.
 
-    Each algorithm as ``hyperparams/`` has it; where it has not been run so to the end, all of it. Ablations have their
-    own figure, and groups without evaluations none.
+    Each algorithm is shown with the hyperparameters of ``hyperparams/``; if no run with these is finished, all groups
+    of the algorithm are shown. Ablations, which have their own figures, and groups without evaluations are left out.
     """
     evaluated = [g for g in groups if any(run.evaluations for run in g.runs) and g.algo not in ABLATIONS]
     shipped = as_shipped([group for group in evaluated if group.finished])
@@ -27,7 +27,11 @@ def headline(groups: Sequence[Group]) -> list[Group]:
 
 
 def bin_width(group: Group) -> int:
-    """Return 20,000 steps, scaled: a multiple of the group's evaluation interval, so that every bin has as many."""
+    """
+    Return the width of a bin in steps: 20,000, scaled with the length of the runs.
+
+    It is a multiple of the group's evaluation interval, so that every bin has the same number of evaluations.
+    """
     scale = group.n_timesteps / group.shipped_steps if group.shipped_steps else 1.0
     frequency = max(group.setting("eval_freq") or 0, 1)
     return max(round(_BIN * scale / frequency), 1) * frequency

@@ -22,7 +22,7 @@ COLORS: dict[str, str] = _OF_SB3 | {
     for name, algorithm in KNOWN_ALGORITHMS.items()
     if (color := vars(algorithm).get("color")) is not None
 }
-OTHER_COLORS = ("#56B4E9", "#000000", "#8C564B", "#9467BD", "#BCBD22", "#17BECF")  # grey is for published ones
+OTHER_COLORS = ("#56B4E9", "#000000", "#8C564B", "#9467BD", "#BCBD22", "#17BECF")  # grey is for published curves
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Curve:
 
 
 def wrap(label: str, width: int) -> str:
-    """Break a long label into at most three lines; what is cut off is in the caption of the figure."""
+    """Break a long label into at most three lines, and cut off the rest: the caption has the whole label."""
     return "\n".join(textwrap.wrap(label, width, max_lines=3, placeholder=" …"))
 
 
@@ -51,7 +51,8 @@ def colors_of(labels: Sequence[str]) -> list[str]:
     """
     Return a colour for each label of one figure.
 
-    An algorithm has its own, with other settings too if it is there once; the others take those that are left.
+    An algorithm with one label in the figure has its own colour, whatever its settings. If it has several labels, only
+    the one without settings has that colour. All other labels take the remaining colours.
     """
     times = Counter(map(_algorithm, labels))
     names = {label: label if times[_algorithm(label)] > 1 else _algorithm(label) for label in labels}
@@ -61,7 +62,7 @@ def colors_of(labels: Sequence[str]) -> list[str]:
 
 
 def _algorithm(label: str) -> str:
-    """``"TDC, λ 0"`` → "TDC"."""
+    """Return the algorithm of a label: ``"TDC, λ 0"`` → "TDC"."""
     return label.partition(",")[0]
 
 
@@ -80,12 +81,12 @@ def draw_curves(
     published: Sequence[PublishedCurve] = (),
 ) -> None:
     """
-    Draw the mean over seeds with its 95 % t interval, every seed as a thin line.
+    Draw the mean over seeds with its 95 % t interval, and every seed as a thin line.
 
-    An unfinished one is dotted, a published mean is dashed, and shown as far as ours go.
+    An unfinished run is a dotted line. A published mean is a dashed line, up to the last step of our curves.
 
-    One seed has no interval; that of a few can be huge, and runs off the axis, which is made for the seeds. On a
-    logarithmic axis, means and intervals are those of the logarithms.
+    One seed has no interval. The interval of a few seeds can be huge, and is cut off where it leaves the axis, which is
+    scaled to the seeds. On a logarithmic axis, means and intervals are those of the logarithms.
     """
     if log:
         axes.set_yscale("log")
@@ -119,10 +120,11 @@ def draw_box_plots(
     axes: Any, labels: Sequence[str], colors: Sequence[Any], returns: Sequence[np.ndarray], title: str
 ) -> None:
     """
-    Draw one box for each algorithm, over the episodes of all its runs (whiskers: 1.5 interquartile ranges); the mean of
-    each run is a dot.
+    Draw one box for each algorithm, over the episodes of all its runs, and the mean of each run as a dot.
 
-    :param returns: for each algorithm (runs, episodes)
+    The whiskers extend to 1.5 interquartile ranges.
+
+    :param returns: for each algorithm, (runs, episodes)
     """
     positions = np.arange(len(labels))
     boxes = axes.boxplot(
@@ -149,12 +151,12 @@ def draw_sweep(
     axes: Any, values: Sequence[float], returns: Sequence[np.ndarray], title: str, xlabel: str, color: Any
 ) -> None:
     """
-    Return against a hyperparameter: the mean over seeds (a diamond) with its 95 % t interval, every seed as a dot.
+    Draw returns against a hyperparameter: the mean over seeds is a diamond with its 95 % t interval, every seed a dot.
 
-    The interval of a few seeds can be huge, and runs off the axis, which is made for the seeds.
+    The interval of a few seeds can be huge, and is cut off where it leaves the axis, which is scaled to the seeds.
 
-    :param values: of the hyperparameter, increasing
-    :param returns: for each value (runs,)
+    :param values: values of the hyperparameter, increasing
+    :param returns: for each value, (runs,)
     """
     means, lows, highs = np.array([mean_interval(r) for r in returns]).T
     axes.plot(values, means, "D-", color=color, lw=1.8, ms=5)
@@ -193,7 +195,7 @@ def draw_intervals(
 
 
 def _cut_intervals(axes: Any, values: np.ndarray, log: bool = False) -> None:
-    """Cut the vertical axis where intervals go further from the values than a third of their range."""
+    """Limit the axis to the values and a third of their range on either side; longer intervals are cut off."""
     if not len(values):
         return
     low, high = np.log((values.min(), values.max())) if log else (values.min(), values.max())

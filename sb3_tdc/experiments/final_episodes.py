@@ -1,6 +1,6 @@
-"""Play 100 mean-action episodes with the last model of every finished run (Fig. 4), and keep their returns with it.
+"""Test returns (Fig. 4): 100 mean-action episodes with the last model of every finished run, stored in its folder.
 
-Episode i begins with the evaluation seed 10,000 + i in every run, so that algorithms meet the same initial states.
+Episode i begins with the evaluation seed 10,000 + i in every run, so that all algorithms meet the same initial states.
 """
 
 import hashlib
@@ -20,12 +20,12 @@ from sb3_tdc.runs.trained import open_run
 
 FILE = "test_returns.npz"
 EPISODES = 100
-FIRST_SEED = 10_000  # of the environment, in the first episode
+FIRST_SEED = 10_000  # seeds the environment in the first episode
 
 
 def play_final_episodes(model: BaseAlgorithm, env: VecEnv, episodes: int, first_seed: int = FIRST_SEED) -> np.ndarray:
     """
-    Play episodes of the mean action, each from the initial state of another seed.
+    Play episodes of the mean action, each from the initial state of its own seed.
 
     :param env: one environment, under a ``Monitor``
     :return: (episodes,), the return of the mean action from the initial state of each seed
@@ -38,7 +38,7 @@ def play_final_episodes(model: BaseAlgorithm, env: VecEnv, episodes: int, first_
 
 
 def checksum(run: Run) -> str:
-    """Return SHA-256 of the model and of its normalisation: what the returns depend on."""
+    """Return the SHA-256 of the model and its normalisation, the files that the returns depend on."""
     digest = hashlib.sha256(run.folder.model.read_bytes())
     normalization = run.folder.normalization(run.folder.model)
     if normalization.is_file():
@@ -47,13 +47,13 @@ def checksum(run: Run) -> str:
 
 
 def read_test_returns(run: Run) -> np.ndarray | None:
-    """Return (episodes,), or None if the model as it is now has not been tested."""
+    """Return the stored test returns, (episodes,), or None if the current model has not been tested."""
     path = run.folder.path / FILE
     if not path.is_file():
         return None
     try:
         tested, returns = read_arrays(path, "checksum", "returns")
-    except ValueError:  # played again
+    except ValueError:  # a damaged file: the episodes are to be played again
         return None
     # Published results have no model that could have changed
     return returns if not run.folder.model.is_file() or str(tested) == checksum(run) else None
@@ -61,11 +61,11 @@ def read_test_returns(run: Run) -> np.ndarray | None:
 
 def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = (), trust: bool = False) -> np.ndarray:
     """
-    Play the episodes and keep their returns, unless they are kept already.
+    Play the test episodes and store their returns, unless these are stored already.
 
-    :param packages: those that a run may import, to register its environment
-    :param trust: whether its files may run code
-    :return: (episodes,)
+    :param packages: packages that a run may import to register its environment
+    :param trust: whether the run's files may run code
+    :return: the returns, (episodes,)
     :raises ValueError: if the run cannot be loaded, or its returns cannot be written
     """
     kept = read_test_returns(run)

@@ -1,4 +1,4 @@
-"""Runs → groups that may be averaged, what may be compared with what, and how it is named."""
+"""Runs → groups of runs that may be averaged; which groups may be compared, and how they are named."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from sb3_tdc.experiments.statistics import final_return
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
-# The length of a run and how it is looked at: no hyperparameters of the algorithm
+# The length of a run, its evaluations and its simulator: not hyperparameters of the algorithm
 _NOT_HYPERPARAMETERS = {"n_timesteps", "eval_freq", "eval_episodes", "mujoco"}
 
 
 @dataclass(frozen=True, order=True)
 class Conditions:
     """
-    What runs have in common that are compared with each other, and drawn in one figure.
+    What runs must have in common to be compared with each other and drawn in one figure.
 
-    :param mujoco: "before 3.5" or "since 3.5", which move Hopper, Ant and Humanoid otherwise, or "of unknown version";
-        "" where it does not matter
+    :param mujoco: "before 3.5", "since 3.5" (Hopper, Ant and Humanoid move differently), or "of unknown version"; ""
+        where it does not matter
     """
 
     env_id: str
@@ -34,7 +34,7 @@ class Conditions:
 
     @property
     def task(self) -> str:
-        """The environment, and MuJoCo's version unless it is the one that published returns were made with."""
+        """The environment, with MuJoCo's version unless it is that of published returns, before 3.5."""
         return f"{self.env_id}, MuJoCo {self.mujoco}" if self._is_other_mujoco else self.env_id
 
     @property
@@ -50,10 +50,10 @@ class Conditions:
 @dataclass(frozen=True)
 class Group:
     """
-    Runs that differ in their seed alone.
+    Runs that differ only in their seed.
 
-    :param label: the algorithm, and in what it differs from the other groups of its algorithm and conditions
-    :param runs: at least one, in the order of their seeds
+    :param label: the algorithm, and the settings that distinguish it from groups of the same algorithm and conditions
+    :param runs: at least one run, in the order of their seeds
     """
 
     label: str
@@ -77,44 +77,44 @@ class Group:
 
     @property
     def finished(self) -> tuple[Run, ...]:
-        """Those that took all their steps, with finite evaluations: the only ones that are averaged."""
+        """The runs that took all their steps, with finite evaluations: only these are averaged."""
         return tuple(run for run in self.runs if run.is_averaged)
 
     @property
     def seeds(self) -> str:
-        """How many, and which."""
+        """The number of finished seeds, and which: ``"3 (1, 2, 3)"``."""
         numbers = ", ".join(str(run.seed) for run in self.finished)
         return f"{len(self.finished)} ({numbers})" if numbers else "0"
 
     @property
     def final_returns(self) -> np.ndarray:
-        """(runs,), the mean of the last evaluation of every finished run"""
+        """The mean of the last evaluation of every finished run, (runs,)."""
         return np.array([final_return(run.evaluations.returns) for run in self.finished if run.evaluations is not None])
 
     @property
     def late_returns(self) -> np.ndarray:
-        """(runs,), the mean of the evaluations in the last third of every finished run that has any there"""
+        """The mean of the evaluations in the last third of every finished run that has any there, (runs,)."""
         return np.array([late.mean() for run in self.finished if len(late := run.late_evaluations())])
 
     @property
     def shipped_steps(self) -> int:
-        """Environment steps of the hyperparameter file, those of the paper for its tasks; 0 if there is no file."""
+        """Environment steps in the hyperparameter file (for the paper's tasks, the paper's); 0 if there is no file."""
         return _shipped(self.algo, self.env_id).get("n_timesteps", 0)
 
     @property
     def share(self) -> float:
-        """Of the steps of the hyperparameter file; NaN if there is no file."""
+        """The length of the runs as a fraction of the steps in the hyperparameter file; NaN if there is no file."""
         return round(self.n_timesteps / self.shipped_steps, 6) if self.shipped_steps else float("nan")
 
     @property
     def name(self) -> str:
-        """The algorithm, and in what it differs from ``hyperparams/``: for tables of many tasks."""
+        """The algorithm, and its hyperparameters that differ from ``hyperparams/``: for tables of many tasks."""
         differing = hyperparameters_not_shipped(self.runs[0]) if _shipped(self.algo, self.env_id) else {}
         return f"{self.algo.upper()}, {describe(differing)}" if differing else self.label
 
     @property
     def commits(self) -> tuple[str, ...]:
-        """Those of this package that its finished runs were trained with."""
+        """The commits of this package that the finished runs were trained with."""
         return tuple(dict.fromkeys(run.folder.versions.get("sb3_tdc", "") for run in self.finished))
 
     @property
@@ -127,9 +127,10 @@ class Group:
 
 def group_runs(runs: Iterable[Run]) -> list[Group]:
     """
-    Put together what may be averaged: runs of one algorithm and environment that differ in their seed alone.
+    Group the runs that may be averaged: runs of one algorithm and environment that differ only in their seed.
 
-    A second run of one seed is a repetition, not another seed: of several, the last one that can be averaged stays.
+    Several runs of one seed are repetitions, and only one of them stays: the last that can be averaged, else the last
+    that is finished, else the last.
     """
     found: dict[str, dict[int, Run]] = {}
     for run in runs:
@@ -144,7 +145,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
 
 def by_conditions(groups: Iterable[Group], tasks: Sequence[str] = ()) -> dict[Conditions, list[Group]]:
     """
-    Put together what is compared.
+    Collect the groups that may be compared with each other: those under the same conditions.
 
     :param tasks: environments that come first, in this order; the others follow by name
     """
@@ -159,7 +160,7 @@ def vary(groups: Iterable[Group], key: str) -> list[list[Group]]:
     """
     Return the ablations of one hyperparameter.
 
-    :return: lists of at least two groups that differ in ``key`` alone, ordered by it
+    :return: lists of at least two groups that differ only in ``key``, ordered by its value
     """
     found: dict[str, list[Group]] = {}
     for group in groups:
@@ -169,7 +170,7 @@ def vary(groups: Iterable[Group], key: str) -> list[list[Group]]:
 
 def have_same_settings(one: Group, other: Group, but: str | None = None) -> bool:
     """
-    Return whether two groups have the same settings, whatever their algorithms.
+    Return whether two groups have the same settings, even if their algorithms differ.
 
     :param but: a setting that may differ
     """
@@ -180,8 +181,8 @@ def as_shipped(groups: Sequence[Group]) -> list[Group]:
     """
     Return one group for each algorithm, with the hyperparameters of ``hyperparams/``.
 
-    :param groups: under the same conditions; of several that differ in their evaluations or their warm-up, the one with
-        the most finished seeds is taken
+    :param groups: groups under the same conditions; if several of an algorithm differ in their evaluations or their
+        warm-up, the one with the most finished seeds is taken
     """
     found: dict[str, Group] = {}
     for group in groups:
@@ -194,16 +195,16 @@ def is_as_shipped(run: Run, but: Iterable[str] = ()) -> bool:
     """
     Return whether a run has the hyperparameters of this package's ``hyperparams/``, whatever its length.
 
-    :param but: settings that may be others
+    :param but: settings that may differ
     """
     return not set(hyperparameters_not_shipped(run)) - set(but)
 
 
 def hyperparameters_not_shipped(run: Run) -> dict[str, Any]:
     """
-    Return the hyperparameters that are not those of ``hyperparams/``.
+    Return the hyperparameters of a run that differ from those of ``hyperparams/``.
 
-    A warm-up that the matrix has shortened, to a tenth of a short run, is not among them.
+    A warm-up that the matrix has shortened to a tenth of a short run is not among them.
     """
     differing = {key: value for key, value in differences(run).items() if key not in _NOT_HYPERPARAMETERS}
     warm_up = _shipped(run.algo, run.env_id).get("learning_starts")
@@ -213,7 +214,7 @@ def hyperparameters_not_shipped(run: Run) -> dict[str, Any]:
 
 
 def differences(run: Run) -> dict[str, Any]:
-    """Return the settings that are not those of this package's ``hyperparams/``, as they are in the run."""
+    """Return the settings of a run that differ from those of this package's ``hyperparams/``, with the run's values."""
     entry = _shipped(run.algo, run.env_id)
     shipped = {**default_settings(run.algo), **entry}
     return {
@@ -225,9 +226,11 @@ def differences(run: Run) -> dict[str, Any]:
 
 def shared_differences(groups: Sequence[Group]) -> str:
     """
-    Say what all groups of an algorithm have other than ``hyperparams/``: their labels name only what tells them apart.
+    Describe the hyperparameters in which all groups of an algorithm differ from ``hyperparams/``.
 
-    :return: ``"All TDC: tau 0.01; all TD3: batch_size 64."``, "" if there is nothing to say
+    The labels of groups name only the settings that distinguish them.
+
+    :return: ``"All TDC: tau 0.01; all TD3: batch_size 64."``, "" if there are none
     """
     said = []
     for algo in dict.fromkeys(group.algo for group in groups):
@@ -259,11 +262,11 @@ def _describe(key: str, value: Any) -> str:
     return f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
 
 
-@cache  # a report asks hundreds of times
+@cache  # a report needs each entry hundreds of times
 def _shipped(algo: str, env_id: str) -> Mapping[str, Any]:
     try:
         return flatten(read_entry(hyperparams_file(algo), env_id)[0])
-    except ValueError:  # of another package
+    except ValueError:  # an algorithm of another package has no file
         return {}
 
 
@@ -276,7 +279,13 @@ def _conditions(run: Run) -> Conditions:
 
 
 def _label(run: Run, representatives: Sequence[Run]) -> str:
-    """Return the algorithm's name, and settings that tell it from its likes and are not those of ``hyperparams/``."""
+    """
+    Return the algorithm's name, and the settings that distinguish the run and differ from ``hyperparams/``.
+
+    A setting distinguishes if it varies among the representatives with the same algorithm and conditions.
+
+    :param representatives: one run of every group
+    """
     likes = [o for o in representatives if o.algo == run.algo and _conditions(o) == _conditions(run)]
     keys = {key for other in likes for key in other.settings}
     telling = {key for key in keys if len({canonical(other.setting(key)) for other in likes}) > 1}
@@ -286,10 +295,10 @@ def _label(run: Run, representatives: Sequence[Run]) -> str:
 
 def _identity(run: Run, without: str | None = None, algo: str | None = None) -> str:
     """
-    Return everything but the seed; a default is the same whether it is given or not.
+    Return a text that is equal for runs that differ only in their seed; an explicit default equals an omitted setting.
 
     :param without: a setting to leave out
-    :param algo: as if it were of this algorithm
+    :param algo: the algorithm to assume instead of the run's
     """
     algo = algo or run.algo
     settings = {**default_settings(algo), **run.settings}

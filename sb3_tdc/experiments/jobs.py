@@ -1,5 +1,5 @@
 """
-One run of ``sb3-tdc train`` in its own folder and process: what the matrix and the search start.
+One run of ``sb3-tdc train`` in its own folder and process, as the matrix and the search start it.
 """
 
 import importlib
@@ -39,9 +39,9 @@ class Job:
     """
     One run to train.
 
-    :param settings: hyperparameters over those of ``hyperparams/``
-    :param logs: the log folder of this run; it may hold others of other algorithms and environments
-    :param packages: to import, that register the environment
+    :param settings: hyperparameters that override those of ``hyperparams/``
+    :param logs: the log folder of this run; it may hold runs of other algorithms and environments
+    :param packages: packages to import, which register the environment
     """
 
     algo: str
@@ -54,7 +54,7 @@ class Job:
 
     @property
     def config(self) -> dict[str, Any]:
-        """All hyperparameters; the warm-up is that of ``hyperparams/``, but at most a tenth of the run."""
+        """All hyperparameters; unless set, the warm-up is that of ``hyperparams/``, but at most a tenth of the run."""
         entry, _ = read_entry(hyperparams_file(self.algo), self.env_id)
         config = {**entry, **self.settings, "n_timesteps": self.n_timesteps}
         if "learning_starts" in entry and "learning_starts" not in self.settings:
@@ -63,7 +63,7 @@ class Job:
 
     @property
     def arguments(self) -> list[str]:
-        """Of ``sb3-tdc train``."""
+        """The arguments of ``sb3-tdc train``."""
         entry, _ = read_entry(hyperparams_file(self.algo), self.env_id)
         params = {k: v for k, v in self.config.items() if k != "n_timesteps" and (k not in entry or entry[k] != v)}
         resume_freq = min(DEFAULT_FREQ, max(self.n_timesteps // 10, 1))
@@ -77,13 +77,13 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """What the run prints."""
+        """The file that the run writes its output to."""
         return self.logs / self.algo / f"{self._env_name}.log"
 
     @property
     def run_folder(self) -> RunFolder | None:
         """
-        None if the run has not begun.
+        The folder of the run; None if the run has not begun.
 
         :raises ValueError: if another run is in its place
         """
@@ -99,7 +99,7 @@ class Job:
 
     @property
     def steps_done(self) -> int:
-        """The step from which it would be resumed."""
+        """The step from which the run would be resumed; all steps if it is finished."""
         folder = self.run_folder
         if folder is None:
             return 0
@@ -114,7 +114,7 @@ class Job:
 
     @property
     def is_trained_elsewhere(self) -> bool:
-        """Whether another process trains it now."""
+        """Return whether another process trains the run now."""
         if not self.log.is_file():
             return False
         log = lock(self.log)
@@ -139,7 +139,7 @@ class Job:
         :raises TrainedElsewhereError: if another process trains this run
         """
         self.log.parent.mkdir(parents=True, exist_ok=True)
-        log = lock(self.log)  # which the process inherits: it is locked as long as the run, or a part of it, lives
+        log = lock(self.log)  # inherited by the process: locked as long as the run or a child of it lives
         if log is None:
             raise TrainedElsewhereError(f"{self}: another process trains it")
         with log:
@@ -151,7 +151,7 @@ class Job:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
-                start_new_session=True,  # a Ctrl-C in the terminal is not for it
+                start_new_session=True,  # a Ctrl-C in the terminal must not reach it
             )
 
     def last_lines(self, n: int = 3) -> list[str]:
@@ -170,12 +170,12 @@ class Job:
 
 
 def eval_freq(n_timesteps: int) -> int:
-    """Return steps between evaluations: the paper's 20,000, and in a short run a thirtieth of it."""
+    """Return the steps between evaluations: the paper's 20,000, but at most a thirtieth of the run."""
     return min(_EVAL_FREQ, max(n_timesteps // 30, 1))
 
 
 def stop(processes: Sequence[subprocess.Popen]) -> None:
-    """Tell processes to stop, wait for their resume states, and close those that have ended."""
+    """Stop processes: wait until they have written their resume states and ended, then close their pipes."""
     for process in processes:
         if process.poll() is None:
             process.terminate()
@@ -187,7 +187,7 @@ def stop(processes: Sequence[subprocess.Popen]) -> None:
 
 def run(job: Job) -> int | None:
     """
-    Run a job to its end; if it is interrupted, it stops with a resume state.
+    Run a job to its end; on an interrupt, it stops with a resume state.
 
     :return: the exit status of ``sb3-tdc train``; None if another process trains the run
     """
@@ -218,9 +218,9 @@ def import_ray() -> Any:
 
 def check_address(address: str) -> None:
     """
-    Check that something answers at the address of a cluster: Ray itself would try for minutes.
+    Check that the address of a cluster answers: Ray itself would try for minutes.
 
-    :raises ValueError: if it is no address, or nothing answers
+    :raises ValueError: if it is not an address, or nothing answers
     """
     if address in ("auto", "local"):  # Ray looks on this machine
         return
@@ -236,16 +236,16 @@ def check_address(address: str) -> None:
 @contextmanager
 def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
     """
-    Start Ray, as long as the context lasts.
+    Start Ray, or connect to a cluster, for the duration of the context.
 
-    :param address: of a cluster that shares this file system; None for this machine
-    :param n_jobs: how many jobs at once on this machine; None for as many as there are cores
-    :return: the module
+    :param address: address of a cluster that shares this file system; None for this machine
+    :param n_jobs: number of jobs at once on this machine; None for one per core
+    :return: the Ray module
     :raises ValueError: if Ray is not installed, or the cluster cannot be reached
     """
     if address is not None:
         check_address(address)
-    os.environ.setdefault("RAY_worker_niceness", "0")  # workers, and so runs, are as nice as this process
+    os.environ.setdefault("RAY_worker_niceness", "0")  # workers, and so the runs, keep the niceness of this process
     ray = import_ray()
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address is None:
@@ -254,7 +254,7 @@ def cluster(address: str | None, n_jobs: int | None) -> Iterator[Any]:
         ray.init(address=address or "local", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ValueError(f"Ray did not start: {' '.join(str(error).split())}") from error
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as a Ctrl-C, also where that is ignored (nohup)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C, even where that is ignored (nohup)
     try:
         yield ray
     finally:

@@ -1,4 +1,4 @@
-"""The runs of a plan, several at once on Ray."""
+"""Training of the runs of a plan, several at once, on Ray."""
 
 import sys
 import time
@@ -19,7 +19,7 @@ class MatrixOutcome:
     """
     How a matrix ended.
 
-    :param failed: a sentence for each job that failed
+    :param failed: one sentence for each failed job
     :param stopped: whether the user stopped the matrix
     """
 
@@ -29,12 +29,16 @@ class MatrixOutcome:
 
 def run_jobs(ray: Any, jobs: Sequence[Job], n_jobs: int | None) -> MatrixOutcome:
     """
-    Run jobs, several at once. One that another process trains is left to it, and looked at again until it is finished.
+    Run jobs, several at once.
 
-    :param ray: the module, initialised
-    :param n_jobs: how many at once; None for as many as Ray has CPUs
+    A job that another process trains is left to that process and checked again every few seconds. Once that process has
+    ended, the job is resumed here, unless it is finished.
+
+    :param ray: the Ray module, initialised
+    :param n_jobs: number of jobs at once; None for one per CPU of Ray
     """
-    # One CPU each, and one thread (in a job's arguments); a job whose machine is lost is started again, and resumes
+    # One CPU for each job, and one thread (in its arguments). If its machine is lost, Ray starts the job again, which
+    # then resumes
     execute = ray.remote(num_cpus=1, max_retries=2)(run)
     queue, outcome = _Queue(jobs), MatrixOutcome([])
     running: dict[Any, tuple[Job, float]] = {}
@@ -65,7 +69,7 @@ def run_jobs(ray: Any, jobs: Sequence[Job], n_jobs: int | None) -> MatrixOutcome
 
 
 class _Queue:
-    """Jobs in their order; one that another process trains comes last, and again after a while."""
+    """A queue of jobs; a job that another process trains goes to its end, to be checked again after a few seconds."""
 
     def __init__(self, jobs: Sequence[Job]):
         self._jobs = deque((0.0, job) for job in jobs)  # with the time from which each may be started
@@ -75,7 +79,7 @@ class _Queue:
         return len(self._jobs)
 
     def pop(self) -> Job | None:
-        """Return the next job to start; None if there is none now."""
+        """Return the next job to start; None if none can be started now."""
         while self._jobs and self._jobs[0][0] <= time.monotonic():
             _, job = self._jobs.popleft()
             if job.is_trained_elsewhere:
@@ -95,7 +99,7 @@ class _Queue:
 
 
 def _wait(ray: Any, references: list[Any]) -> list[Any]:
-    """Return those that have ended, after a second at most."""
+    """Return the references whose jobs have ended; waits for one second at most."""
     if not references:
         time.sleep(1.0)
         return []

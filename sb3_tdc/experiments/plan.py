@@ -1,4 +1,4 @@
-"""The runs of a suite: what there is to do, and how long it takes."""
+"""The plan of a suite: which runs to train, and how long they take."""
 
 import heapq
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,10 +19,10 @@ from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 @dataclass(frozen=True)
 class Plan:
     """
-    What is to be done for a suite.
+    The jobs of a suite.
 
-    :param jobs: what a suite asks for, each once
-    :param missing: a sentence for each cell that cannot be run here
+    :param jobs: the jobs that the suite requires, without duplicates
+    :param missing: one sentence for each cell that cannot be run here
     """
 
     jobs: list[Job]
@@ -33,8 +33,9 @@ def select(cells: Iterable[Cell], only: Sequence[str]) -> list[Cell]:
     """
     Select cells of a suite.
 
-    :param only: algorithms and environments; where none of a kind is named, all of it
-    :raises ValueError: for one that no cell has
+    :param only: names of algorithms and environments; if no algorithm is named, all algorithms are selected, and if no
+        environment is named, all environments
+    :raises ValueError: for a name that no cell has
     """
     cells = list(cells)
     algos, env_ids = {cell.algo for cell in cells}, {cell.env_id for cell in cells}
@@ -48,10 +49,10 @@ def select(cells: Iterable[Cell], only: Sequence[str]) -> list[Cell]:
 
 def make_plan(cells: Sequence[Cell], seeds: Sequence[int], scale: float, logs: Path) -> Plan:
     """
-    Make the plan seed by seed, so that a matrix that is stopped early has something of every cell.
+    Make the plan seed by seed, so that a matrix that is stopped early has runs of every cell.
 
-    :param scale: the fraction of the suite's steps
-    :param logs: of all runs; those of a scale, or of a number of steps, have a folder of their own
+    :param scale: fraction of the suite's steps
+    :param logs: folder of all runs; each scale, or number of steps, has its own subfolder
     """
     missing = {f"{cell.algo} on {cell.env_id}": _why_missing(cell) for cell in cells}
     possible = [cell for cell in cells if not missing[f"{cell.algo} on {cell.env_id}"]]
@@ -66,7 +67,8 @@ def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
     """
     Make the job of a cell and a seed.
 
-    What a cell says that ``hyperparams/`` or a default says too is left out: cells of two suites may be one job.
+    Settings of the cell that equal those of ``hyperparams/`` or a default are left out, so that equal cells of two
+    suites are one job.
     """
     entry, _ = read_entry(hyperparams_file(cell.algo), cell.env_id)
     implied = {**default_settings(cell.algo), **entry}
@@ -98,7 +100,7 @@ def _why_missing(cell: Cell) -> str:
 
 
 def estimate_seconds(seconds: Iterable[float], n_jobs: int) -> float:
-    """Return the time until all jobs have ended, if each is taken by the first of ``n_jobs`` workers that is free."""
+    """Return the time until all jobs have ended, if the first free one of ``n_jobs`` workers takes each."""
     free_at = [0.0] * n_jobs
     for duration in seconds:
         heapq.heappush(free_at, heapq.heappop(free_at) + duration)
@@ -106,7 +108,7 @@ def estimate_seconds(seconds: Iterable[float], n_jobs: int) -> float:
 
 
 def dry_run(plan: Plan, rates: Mapping[tuple[str, str], float], n_jobs: int) -> None:
-    """Print what would be done with every job, and how long it would take."""
+    """Print for every job whether it would be run, resumed or skipped, and the time that all would take."""
     rates, seconds = dict(rates), []
     for job in plan.jobs:
         key, done = (job.algo, job.env_id), job.steps_done

@@ -1,4 +1,4 @@
-"""Where a report comes from, what of the paper it has, and what it lacks."""
+"""The provenance of a report, and which of the paper's experiments it has or lacks."""
 
 import os
 import platform
@@ -30,7 +30,7 @@ _TITLES = {
 
 
 def compare_with_paper(runs: Sequence[Run]) -> list[tuple[str, pd.DataFrame]]:
-    """Return titles and tables: the seeds of every experiment of the paper, and why the absent ones are absent."""
+    """Return titles and tables: the seeds of every experiment of the paper, and why absent runs are absent."""
     found = []
     absent: dict[str, dict[str, list[str]]] = {}
     for suite, cells in PAPER.items():
@@ -79,7 +79,7 @@ def _why_absent(cell: Cell) -> str:
 
 
 def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFrame:
-    """List runs that are not averaged, and why; empty if there are none."""
+    """List the runs that are not averaged, and why; the table is empty if there are none."""
     rows = []
     for run in runs:
         if not run.is_averaged:
@@ -98,7 +98,7 @@ def list_unfinished(runs: Sequence[Run], unreadable: Sequence[str]) -> pd.DataFr
 
 
 def describe_groups(groups: Sequence[Group]) -> pd.DataFrame:
-    """Describe which hyperparameters of every group are not those of ``hyperparams/``."""
+    """Describe every group: its seeds, its commits, and the settings that differ from ``hyperparams/``."""
     return pd.DataFrame(
         [
             {
@@ -120,7 +120,7 @@ def _short(commit: str) -> str:
 
 
 def describe_runs(runs: Sequence[Run]) -> pd.DataFrame:
-    """Describe every run: its command, and what it was trained with."""
+    """Describe every run: its steps, its time, its command, and the versions that it was trained with."""
     rows = []
     for run in runs:
         elapsed = run.progress("time/time_elapsed")

@@ -1,6 +1,6 @@
-"""Copy the small files of finished runs into a folder that can be committed: all that the report reads.
+"""Copies of the small files of finished runs, in a folder that can be committed: all that the report reads.
 
-A run keeps its place below the folder, so that the matrix finds it there and does not train it again.
+A run keeps its relative path, so that the matrix finds its copy and does not train it again.
 """
 
 import re
@@ -20,26 +20,26 @@ from sb3_tdc.runs.settings import RunSettings, flags_of
 
 RESULTS = Path("results")
 _SETTINGS = ("config.yml", "versions.yml", "finished.yml", "changes.yml")
-# Rows of the log; more show the same curve
+# Rows of the log that are kept; more would show the same curve
 _ROWS = 150
 _COLUMNS = ("time/", "train/", "eval/", "board/", "rollout/ep_rew_mean")
 _LEFT_OUT = ("time/fps", "time/episodes", "time/critics_elapsed")
 
-# The flags of the log folder, and how they begin the word that holds it too
+# The flags of the log folder, and the pattern of a word that holds both the flag and the folder
 _LOG_FOLDER = flags_of(RunSettings.__dataclass_fields__["log_folder"])
 _JOINED = re.compile(rf"^(-f|(?:{'|'.join(_LOG_FOLDER)})=).+", re.DOTALL)
 
 
 def publish(run: Run, logs: Path, folder: Path) -> Path:
     """
-    Copy the small files of a finished run; its log thinned, its paths relative to ``logs``.
+    Copy the small files of a finished run, with its log thinned and its log folder relative to ``logs``.
 
-    Test returns are copied if they are those of the model as it is now. What an earlier copy had and the run no longer
-    has is removed.
+    Test returns are copied only if they belong to the current model. Files of an earlier copy that the run no longer
+    has are removed.
 
     :param logs: a folder above the run, or the run's own
-    :return: where they are
-    :raises ValueError: if something else than an earlier copy of the run is there
+    :return: the folder of the copy
+    :raises ValueError: if that folder holds anything but an earlier copy of the run
     """
     source, place = run.folder, folder / _place(run, logs)
     _check_is_copy(place, run)
@@ -61,16 +61,16 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
 
 
 def _place(run: Run, logs: Path) -> Path:
-    """Return where a run lies below a folder of runs, with at least its ``<algo>/<environment>_<number>``."""
+    """Return the path of a run relative to a folder of runs: at least ``<algo>/<environment>_<number>``."""
     below = run.folder.path.relative_to(logs)
     return below if len(below.parts) > 1 else Path(*Path(abspath(run.folder.path)).parts[-2:])
 
 
 def _check_is_copy(place: Path, run: Run) -> None:
     """
-    Check that a run in a place, if there is one, is an earlier copy of the one to publish.
+    Check that the run in a folder, if there is one, is an earlier copy of the run to publish.
 
-    :raises ValueError: if it is another
+    :raises ValueError: if it is another run
     """
     if not any(place.glob("*/args.yml")):
         return
@@ -89,12 +89,12 @@ def _identity(run: Run, may_differ: set[str]) -> dict[str, Any]:
 
 
 def _may_differ(run: Run) -> set[str]:
-    """Return the settings that may be changed when a run is resumed, or were: it is the same run."""
+    """Return the settings that may change, or have changed, when the run is resumed: it stays the same run."""
     return {"n_timesteps", "changes", *(key for each in run.folder.changes for key in flatten(each["hyperparams"]))}
 
 
 def _mirror(source: Path, target: Path, is_valid: bool = True) -> None:
-    """Copy a file, or remove the copy of one that is no longer there, or valid."""
+    """Copy a file; if it is missing or no longer valid, remove its earlier copy."""
     if source.is_file() and is_valid:
         shutil.copyfile(source, target)
     else:
@@ -102,7 +102,7 @@ def _mirror(source: Path, target: Path, is_valid: bool = True) -> None:
 
 
 def _without_programs(command: str) -> str:
-    """Return a command without the folders of the interpreter and of the script."""
+    """Return a command without the paths of the interpreter and of the script."""
     words = shlex.split(command)
     programs = [Path(word).name for word in words[:2]]
     return shlex.join([*(programs[1:] if programs[1:] == ["sb3-tdc"] else programs), *words[2:]])
@@ -118,7 +118,11 @@ def _with_log_folder(command: str, folder: str) -> str:
 
 
 def _thin(log: pd.DataFrame) -> pd.DataFrame:
-    """Return at most ``_ROWS`` rows of what was trained and timed, and every row with an evaluation."""
+    """
+    Return the columns on training, timing and evaluations, with fewer rows.
+
+    At most ``_ROWS`` rows are kept, and in addition every row with an evaluation.
+    """
     columns = [name for name in log if str(name).startswith(_COLUMNS) and name not in _LEFT_OUT]
     evenly = np.unique(np.linspace(0, len(log) - 1, _ROWS).round().astype(int))
     evaluated = [name for name in log if str(name).startswith("eval/")]

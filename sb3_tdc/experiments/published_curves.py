@@ -1,9 +1,9 @@
 """
 Learning curves that others have published, as data: to be shown next to ours, never mixed with them.
 
-``published_curves.csv`` has mean and standard deviation over seeds, by environment step, on Gymnasium's -v4 tasks. They
-were computed from the files of every seed in the repository DAVIAN-Robotics/SimbaV2 (commit 86899c2, November 2025,
-Apache-2.0), made with MuJoCo before 3.5; CrossQ has every tenth point.
+``published_curves.csv`` has the mean and standard deviation over seeds at each environment step, on Gymnasium's -v4
+tasks. They were computed from the files of every seed in the repository DAVIAN-Robotics/SimbaV2 (commit 86899c2,
+November 2025, Apache-2.0), made with MuJoCo before 3.5; of CrossQ, every tenth point is kept.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _FILE = Path(__file__).with_suffix(".csv")
 @dataclass(frozen=True)
 class PublishedCurve:
     """
-    One algorithm on one task.
+    The learning curve of one algorithm on one task.
 
     :param steps: (points,), environment steps
     :param mean: (points,), over seeds
@@ -36,11 +36,11 @@ class PublishedCurve:
     std: np.ndarray
 
     def interval(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mean, low and high, (points,): the 95 % interval of the mean by Student's t over seeds."""
+        """Return mean, low and high, each (points,): the 95 % interval of the mean by Student's t over seeds."""
         return interval_of(self.mean, self.std, self.seeds)
 
     def at(self, step: int) -> tuple[float, float, float]:
-        """Return mean, low and high at a step, between the two nearest points; NaN beyond the last."""
+        """Return mean, low and high at a step, interpolated between the two nearest points; NaN outside the curve."""
         beyond = {"left": np.nan, "right": np.nan}
         mean, low, high = (float(np.interp(step, self.steps, values, **beyond)) for values in self.interval())
         return mean, low, high
@@ -52,11 +52,11 @@ def _read() -> pd.DataFrame:
 
 
 def published_curves(env_id: str) -> list[PublishedCurve]:
-    """Return what is published for a task, in the order of the file."""
+    """Return the published curves of a task, in the order of the file."""
     rows = _read()
     rows = rows[rows["environment"] == env_id]
     curves = []
-    rows = rows[rows["std"].notna()]  # one seed alone has also been evaluated before its training
+    rows = rows[rows["std"].notna()]  # a point of one seed, evaluated before training, has none
     for (source, algorithm), some in rows.groupby(["source", "algorithm"], sort=False):
         numbers = [some[name].to_numpy(float) for name in ("step", "mean", "std")]
         curves.append(PublishedCurve(source, algorithm, int(some["seeds"].iloc[0]), *numbers))

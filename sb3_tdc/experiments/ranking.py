@@ -1,4 +1,4 @@
-"""What a search has found: a table, figures, and the hyperparameters of the best candidate."""
+"""Results of a search: a table, figures, and the hyperparameters of the best candidate."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,12 +16,13 @@ from sb3_tdc.hyperparams import hyperparams_file, read_entry
 
 def rank(candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> pd.DataFrame:
     """
-    Rank the best first: by the mean over seeds of the mean of all evaluations, at the steps that all its seeds have.
+    Rank candidates, best first, by the mean over seeds of the mean of all evaluations.
 
-    A candidate with fewer steps than another (stopped early, or failed) comes after it.
+    Only the evaluations that all seeds of a candidate have are counted. A candidate with fewer steps than another
+    (stopped early, or failed) comes after it.
 
-    :param candidates: of each, its seeds
-    :param searched: names of hyperparameters, the first columns
+    :param candidates: for each candidate, the jobs of its seeds
+    :param searched: names of the searched hyperparameters, which are the first columns
     """
     rows = []
     for number, jobs in enumerate(candidates):
@@ -39,11 +40,11 @@ def rank(candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> pd.Dat
 
 def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
     """
-    Return against one hyperparameter, as PNG and PDF, at the steps that all candidates have.
+    Draw the return against one hyperparameter, over the steps that all candidates have, as PNG and PDF.
 
-    Where others are searched too, each value is represented by its best candidate.
+    If other hyperparameters are searched too, each value is represented by its best candidate.
 
-    :param path: without a suffix
+    :param path: path of the figures, without a suffix
     """
     from matplotlib.figure import Figure
 
@@ -66,7 +67,7 @@ def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
 
 
 def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> None:
-    """Print the table; write it, the figures, and the hyperparameters of the best."""
+    """Print the ranking, and write it, the figures, and the hyperparameters of the best candidate."""
     table = rank(candidates, searched)
     table.to_csv(folder / "ranking.csv", index=False)
     print(table.to_string(index=False, float_format=lambda x: f"{x:g}", na_rep="–"))
@@ -76,7 +77,7 @@ def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: S
             draw(candidates, key, folder / key)
     best = candidates[int(table.index[0])][0]
     entry, _ = read_entry(hyperparams_file(best.algo), best.env_id)
-    content = {best.env_id: {**entry, **best.settings}}  # with the steps of a whole training
+    content = {best.env_id: {**entry, **best.settings}}  # with the number of steps of a whole training, not of a trial
     (folder / "best.yml").write_text(plain_yaml.dump(content, sort_keys=False))
     print(f"Ranking, figures and the best hyperparameters are in {folder}")
     packages = ["--gym-packages", *best.packages] if best.packages else []

@@ -1,4 +1,4 @@
-"""How fast runs are: as finished runs of the same kind were, or as a short training is."""
+"""The speed of runs, from finished runs of the same algorithm and environment, or from a short training."""
 
 import tempfile
 import time
@@ -14,16 +14,16 @@ from sb3_tdc.runs.settings import RunSettings
 from sb3_tdc.runs.setup import make_run
 from sb3_tdc.runs.training import train
 
-# The first updates compile, allocate, warm up
+# The steps between which time is measured: the first updates compile, allocate and warm up
 _FIRST_STEP, _LAST_STEP = 100, 300
 MEASURED_STEPS = _LAST_STEP - _FIRST_STEP
 
 
 def read_rates(logs: Path) -> dict[tuple[str, str], float]:
     """
-    Return environment steps per second, evaluations included, of finished runs.
+    Return the environment steps per second of finished runs, including evaluations.
 
-    :return: by algorithm and environment, the median; including the time before a stopped run was resumed
+    :return: the median by algorithm and environment; a resumed run counts with its time before the interruption
     """
     found: dict[tuple[str, str], list[float]] = {}
     try:
@@ -38,7 +38,7 @@ def read_rates(logs: Path) -> dict[tuple[str, str], float]:
 
 
 class _Clock(BaseCallback):
-    """Read step and time from a step on."""
+    """Record step and time, from ``_FIRST_STEP`` on."""
 
     def _on_training_start(self) -> None:
         self.readings: list[tuple[int, float]] = []
@@ -50,11 +50,11 @@ class _Clock(BaseCallback):
 
 
 def measure_rate(job: Job) -> float:
-    """Return environment steps per second, with updates, without evaluations; on one thread, over a few hundred."""
+    """Measure environment steps per second over a few hundred steps on one thread, with updates but no evaluations."""
     clock = _Clock()
     n_timesteps = max(_LAST_STEP, 10 * job.config.get("n_envs", 1))
     config = replace(job, n_timesteps=n_timesteps).config
-    # Also where the job sets it
+    # Also where the job sets it: the measured steps must include updates
     config["learning_starts"] = min(config.get("learning_starts", _FIRST_STEP), _FIRST_STEP)
     with tempfile.TemporaryDirectory() as folder:
         settings = RunSettings(

@@ -1,7 +1,7 @@
 """The report on a folder of runs: figures and tables, next to the paper's and other published results.
 
-One HTML file that needs no other, and the same figures (SVG, PNG, PDF) and tables (CSV) next to it, with a list of
-them. Reads only what runs have left; trains and plays nothing.
+It is one self-contained HTML file, with the same figures (SVG, PNG, PDF) and tables (CSV) next to it, and a list of
+them. It is made from the files of runs alone, without training or playing anything.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
 
 def make_warnings(groups: Sequence[Group]) -> list[str]:
-    """Return what a reader must know before looking at a figure."""
+    """Return the warnings that a reader must know before looking at a figure."""
     shares = sorted({g.share for g in groups if g.finished and g.shipped_steps})
     fewest = min((len(g.finished) for g in groups if g.finished), default=0)
     said = []
@@ -60,7 +60,8 @@ def write_report(runs: Sequence[Run], unreadable: Sequence[str], folder: Path) -
     """
     Write the page, its figures and its tables.
 
-    :param folder: made if it does not exist; figures and tables of an earlier report there are removed
+    :param unreadable: one sentence for each run that cannot be read
+    :param folder: created if it does not exist; figures and tables of an earlier report in it are removed
     :return: the page
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined

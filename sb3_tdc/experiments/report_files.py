@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-# What a report has written next to its page, one path a line: the next report removes these
+# The files that a report has written next to its page, one path per line: the next report removes old ones
 _LIST = "report_files.txt"
 
 
@@ -19,7 +19,7 @@ class Picture:
     """
     A figure as the page shows it.
 
-    :param svg: base64
+    :param svg: the figure as SVG, base64-encoded
     """
 
     name: str
@@ -29,9 +29,9 @@ class Picture:
 
 class ReportFiles:
     """
-    Write the figures and tables of a report.
+    The figures and tables that a report writes.
 
-    :param folder: made with the first of them
+    :param folder: created with the first file
     """
 
     def __init__(self, folder: Path):
@@ -39,16 +39,16 @@ class ReportFiles:
         self.names: list[str] = []
 
     def new_file(self, name: str) -> Path:
-        """Return where a file of the report is written, and add it to the list."""
+        """Return the path for a new file of the report, and add it to the list."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         self.names.append(name)
-        with (self.folder / _LIST).open("a", encoding="utf-8") as files:  # known even if the report stops half-way
+        with (self.folder / _LIST).open("a", encoding="utf-8") as files:  # now: the report may stop half-way
             files.write(f"{name}\n")
         return path
 
     def draw(self, name: str, caption: str, function: Callable[..., None], *args: Any, **kwargs: Any) -> Picture:
-        """Draw one figure by a function of axes and arrays, and write it as SVG, PNG and PDF."""
+        """Draw one figure with a function of axes and arrays, and write it as SVG, PNG and PDF."""
         import matplotlib
         from matplotlib.figure import Figure
 
@@ -64,11 +64,11 @@ class ReportFiles:
         return Picture(file, caption, base64.b64encode(svg.getvalue()).decode())
 
     def write_table(self, name: str, table: pd.DataFrame) -> None:
-        """Write numbers as CSV."""
+        """Write a table as CSV."""
         table.to_csv(self.new_file(f"tables/{name}.csv"), index=False)
 
     def remove_old(self) -> None:
-        """Remove figures and tables of an earlier report, and nothing else: some may be of runs that are gone."""
+        """Remove figures and tables that only an earlier report wrote (their runs may be gone), and nothing else."""
         for name in {*(self.folder / _LIST).read_text(encoding="utf-8").splitlines()} - {*self.names}:
             if re.fullmatch(r"(figures|tables)/[^/]+", name) and (self.folder / name).is_file():
                 (self.folder / name).unlink()

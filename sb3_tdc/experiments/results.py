@@ -1,4 +1,4 @@
-"""Folders of runs (RL Zoo's layout) → settings and arrays. Reads only; loads no model, and unpickles nothing."""
+"""Folders of runs (RL Zoo's layout) → settings and arrays. Only reads files; loads no model, unpickles nothing."""
 
 import json
 import os
@@ -23,15 +23,15 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.settings import Role, defaults
 from sb3_tdc.safe_load import read_system_info
 
-# The part of a run that is late in training
+# The last part of a run that counts as late in training
 _LATE = 1 / 3
-# Settings that make another experiment of the same hyperparameters, and their defaults
+# Settings that make another experiment even with the same hyperparameters, and their defaults
 _SETTINGS = defaults(Role.EXPERIMENT)
 
 
 @dataclass(frozen=True)
 class Run:
-    """One seed: what ``sb3-tdc train`` was told, and what it left in its folder."""
+    """A run of one seed: the settings given to ``sb3-tdc train``, and the files in its folder."""
 
     folder: RunFolder
     algo: str
@@ -44,13 +44,13 @@ class Run:
         """
         Open the folder of a run, and read all of its files.
 
-        :raises ValueError: if the folder is not one of a run
+        :raises ValueError: if the folder is not that of a run, or a file in it cannot be read
         """
         folder = RunFolder.open(path)
         try:
             args, config = folder.args, folder.config
             changed = {key: args[key] for key, default in _SETTINGS.items() if args.get(key, default) != default}
-            if folder.changes:  # half of a run was of other hyperparameters
+            if folder.changes:  # a part of the run had other hyperparameters
                 changed["changes"] = folder.changes
             run = cls(
                 folder,
@@ -72,7 +72,7 @@ class Run:
 
     def _read_all(self) -> None:
         """
-        Read all files now, so that a damaged one is known.
+        Read all files now, so that a damaged one is found before anything is averaged.
 
         :raises ValueError: if a file is truncated or damaged
         """
@@ -83,17 +83,17 @@ class Run:
             raise ValueError(f"{self.folder.path} has a file that cannot be read ({reason})") from error
 
     def setting(self, key: str) -> Any:
-        """Return a hyperparameter, or what is taken where none is given."""
+        """Return the value of a setting, or its default if none is given."""
         return self.settings.get(key, default_settings(self.algo).get(key))
 
     @property
     def n_timesteps(self) -> int:
-        """Environment steps the run was to take."""
+        """Environment steps that the run was to take."""
         return self.folder.n_timesteps
 
     @cached_property
     def steps(self) -> int:
-        """Environment steps it has taken, as far as its files tell."""
+        """Environment steps that the run has taken, as far as its files tell."""
         if self.folder.model.is_file():
             return self.folder.steps_of_model()
         if self.folder.steps_at_end is not None:
@@ -108,17 +108,17 @@ class Run:
 
     @property
     def is_complete(self) -> bool:
-        """Return whether it has also taken all its steps: a callback may have ended it before."""
+        """Return whether the run is finished and has taken all its steps: a callback may have ended it earlier."""
         return self.is_finished and self.steps >= self.n_timesteps
 
     @property
     def is_averaged(self) -> bool:
-        """Return whether it is complete and evaluated, each time with a finite return."""
+        """Return whether the run is complete and has evaluations, all with finite returns."""
         return self.is_complete and self.evaluations is not None and bool(np.isfinite(self.evaluations.returns).all())
 
     @cached_property
     def evaluations(self) -> Evaluations | None:
-        """None if it has not been evaluated."""
+        """The evaluations; None if the run has not been evaluated."""
         return read_evaluations(self.folder)
 
     @cached_property
@@ -133,8 +133,8 @@ class Run:
         """
         Read columns of the log.
 
-        :param columns: of ``progress.csv``
-        :return: (rows,), or (rows, columns) of several, where all of them are known
+        :param columns: names of columns in ``progress.csv``
+        :return: (rows,) for one column, (rows, columns) for several; only rows in which all of them have a value
         """
         log = self.log
         values = log[list(columns)].dropna().to_numpy() if set(columns) <= set(log) else np.empty((0, len(columns)))
@@ -156,7 +156,7 @@ class Run:
 
     @cached_property
     def system(self) -> str:
-        """The versions and the commit it was trained with; of a run without these, what SB3 keeps in the model."""
+        """The versions and the commit that the run was trained with; without these, what SB3 keeps in the model."""
         if versions := self.folder.versions:
             return " · ".join(f"{name} {value}" for name, value in versions.items())
         if not self.folder.model.is_file():
@@ -172,10 +172,10 @@ class Run:
 
 def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
     """
-    Find every run below some folders, also through links.
+    Find every run below some folders, following symbolic links.
 
-    :return: every run, folder after folder, in the order of its path, and a sentence for each that cannot be read
-    :raises ValueError: if there is none below one of the folders
+    :return: the runs, folder after folder, ordered by path, and one sentence for each run that cannot be read
+    :raises ValueError: if there is no run below one of the folders, or none can be read
     """
     runs, unreadable, seen = [], [], set()
     for folder in folders:
@@ -198,7 +198,7 @@ def find_runs(*folders: Path) -> tuple[list[Run], list[str]]:
 
 
 def _folders_below(folder: Path) -> Iterator[Path]:
-    """Yield every folder below one, once; links are followed last, so that what they lead to has its own path."""
+    """Yield every folder below one, once. Links are followed last, so that folders below it keep their own paths."""
     waiting, seen = deque([folder]), set()
     while waiting:
         for name, folders, _ in os.walk(waiting.popleft()):
@@ -213,13 +213,13 @@ def _folders_below(folder: Path) -> Iterator[Path]:
 
 
 def _by_number(path: Path) -> tuple[Path, str, int]:
-    """Order folders as they were made: Hopper-v4_10 after Hopper-v4_9."""
+    """Return a sort key by the number in the name: Hopper-v4_10 comes after Hopper-v4_9."""
     name, _, number = path.name.rpartition("_")
     return path.parent, name, int(number) if number.isdigit() else 0
 
 
 def _physics(env_id: str, versions: Mapping[str, str]) -> dict[str, str]:
-    """Return which MuJoCo moved a task of MuJoCo: its contacts are others since 3.5 (docs/differences.md)."""
+    """Return the setting ``mujoco`` of a task that may use MuJoCo: contacts differ since 3.5 (docs/differences.md)."""
     version = re.match(r"(\d+)\.(\d+)", str(versions.get("mujoco", "")))
     if not _may_use_mujoco(env_id):
         return {}
@@ -229,7 +229,7 @@ def _physics(env_id: str, versions: Mapping[str, str]) -> dict[str, str]:
 
 
 def _may_use_mujoco(env_id: str) -> bool:
-    """Return False for PyBullet's, Isaac Lab's and Gymnasium's other tasks: which MuJoCo is installed is no matter."""
+    """Return whether a task may use MuJoCo; PyBullet's, Isaac Lab's and Gymnasium's other tasks do not."""
     if simulator_of(env_id) is not GYMNASIUM:
         return False
     entry_point = str(gym.registry[env_id].entry_point) if env_id in gym.registry else ""
@@ -244,7 +244,7 @@ def default_settings(algo: str) -> dict[str, Any]:
 
 
 def canonical(value: Any) -> str:
-    """Return a canonical text of settings (1 equals 1.0)."""
+    """Return a canonical text of settings, in which 1 equals 1.0."""
 
     def same(item: Any) -> Any:
         if isinstance(item, dict):
@@ -257,17 +257,17 @@ def canonical(value: Any) -> str:
 
 
 def same_settings(one: Any, other: Any) -> bool:
-    """Return whether two settings say the same: 1 and 1.0 do."""
+    """Return whether two settings are equal; 1 equals 1.0."""
     return canonical(one) == canonical(other)
 
 
 def check_same_run(path: Path, here: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """
-    Check that the run in a folder is the wanted one.
+    Check that the run in a folder is the wanted run.
 
-    :param here: its settings
-    :param wanted: those of the wanted one
-    :raises ValueError: if it is another run, naming what differs
+    :param here: settings of the run in the folder
+    :param wanted: settings of the wanted run
+    :raises ValueError: if it is another run; the message names the settings that differ
     """
     differing = [key for key in {**here, **wanted} if not same_settings(here.get(key), wanted.get(key))]
     if differing:

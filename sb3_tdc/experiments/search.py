@@ -18,8 +18,8 @@ def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
     """
     Make the jobs of every candidate.
 
-    :return: for every candidate, its seeds
-    :raises ValueError: for anything that is not allowed
+    :return: for every candidate, the jobs of its seeds
+    :raises ValueError: if an argument is not allowed
     """
     for name in ("n_timesteps", "seeds", "samples", "jobs"):
         value = getattr(args, name)

@@ -1,4 +1,4 @@
-"""Which candidates a search tries: texts of the command line → hyperparameters. Nothing is evaluated."""
+"""The candidates that a search tries: texts of the command line → hyperparameters. No text is run as code."""
 
 import itertools
 import re
@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_tdc.common import plain_yaml
 
-# Those of the paper
+# The values of λ in the paper
 LAMBDAS = [round(0.1 * i, 1) for i in range(1, 11)]
 _DISTRIBUTION = re.compile(r"(\w+)\(([^,()]+),([^,()]+)\)")
 
@@ -22,7 +22,7 @@ class Distribution:
 
     :param kind: "uniform", "loguniform" or "randint"
     :param low: smallest value
-    :param high: largest value (of "randint" too)
+    :param high: largest value, included (for "randint" too)
     """
 
     kind: str
@@ -42,7 +42,7 @@ class Distribution:
 
 def parse_space(texts: Sequence[str]) -> dict[str, list[Any] | Distribution]:
     """
-    Parse ``["kappa:[1.0, 10.0]", "tau:loguniform(1e-4, 1e-2)"]`` → what to try of every hyperparameter.
+    Parse ``["kappa:[1.0, 10.0]", "tau:loguniform(1e-4, 1e-2)"]`` into the values to try of every hyperparameter.
 
     :raises ValueError: for anything else
     """
@@ -86,7 +86,7 @@ def make_candidates(space: Mapping[str, list[Any] | Distribution], n_samples: in
     """
     Make every combination of the lists, each with every one of ``n_samples`` joint draws of the distributions.
 
-    :return: each once; the same for the same arguments
+    :return: the candidates, without duplicates; the same for the same arguments
     """
     lists = {key: values for key, values in space.items() if isinstance(values, list)}
     drawn = {key: values for key, values in space.items() if isinstance(values, Distribution)}

@@ -22,7 +22,7 @@ from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import ISAAC, MUJOCO, PYBULLET
 from sb3_tdc.experiments.variants import Comparison, compare_settings, compare_variants
 
-# How the last columns of two tables are made
+# The end of two captions: how the columns of returns, difference and p-value are computed
 _COMPARED = (
     "mean ± standard deviation over seeds of the evaluations in the last third of a run; the difference with Welch's "
     "95 % interval; its p-value, corrected by Holm's method for the number of comparisons with several seeds on the "
@@ -35,7 +35,7 @@ class Section:
     """
     A part of the page.
 
-    :param tables: pairs of caption and cells to read
+    :param tables: pairs of caption and formatted cells
     """
 
     title: str
@@ -48,7 +48,7 @@ class Report:
     """
     The sections of a page.
 
-    :param folder: where their figures and tables are written
+    :param folder: the folder that figures and tables are written to
     """
 
     def __init__(self, groups: Sequence[Group], folder: Path):
@@ -57,7 +57,7 @@ class Report:
         self.conditions = by_conditions(groups, (*MUJOCO, *PYBULLET, *ISAAC))
 
     def add_table(self, section: Section, name: str, table: pd.DataFrame, caption: str = "") -> None:
-        """Write a table of cells to read, and show it; an empty one is left out."""
+        """Write a table of formatted cells and add it to a section, unless it is empty."""
         if len(table):
             self.files.write_table(name, table)
             section.tables.append((caption, table))
@@ -65,7 +65,7 @@ class Report:
     def draw_learning_curves(
         self, name: str, groups: Sequence[Group], labels: Sequence[str], colors: Sequence[Any]
     ) -> Picture:
-        """Draw the evaluations of groups under the same conditions."""
+        """Draw the learning curves of groups under the same conditions."""
         conditions = groups[0].conditions
         width = max(map(bin_width, groups))
         curves = [
@@ -206,7 +206,7 @@ class Report:
         return pictures
 
     def draw_sweep(self, name: str, groups: Sequence[Group]) -> Picture:
-        """Draw final returns against λ, of groups that differ in a fixed λ alone."""
+        """Draw final returns against λ, for groups that differ only in a fixed λ."""
         conditions, values = groups[0].conditions, [group.setting("lam") for group in groups]
         return self.files.draw(
             f"{name}-{conditions.file_name}",
@@ -232,7 +232,7 @@ class Report:
         return section
 
     def ablations(self, key: str) -> list[list[Group]]:
-        """Return groups of TDC that differ in one setting alone."""
+        """Return lists of TDC groups that differ only in one setting."""
         return vary([g for groups in self.conditions.values() for g in groups if g.algo == "tdc"], key)
 
     def td_errors(self) -> Section:
@@ -348,7 +348,7 @@ def read_all_test_returns(group: Group) -> np.ndarray:
     """
     Read the test returns of a group.
 
-    :return: (finished runs that have played them, episodes that all of these have played)
+    :return: (finished runs with test returns, episodes that all of these have played)
     """
     played = [returns for run in group.finished if (returns := read_test_returns(run)) is not None]
     fewest = min(map(len, played), default=0)
@@ -356,7 +356,7 @@ def read_all_test_returns(group: Group) -> np.ndarray:
 
 
 def _about(conditions: Conditions) -> str:
-    """Return the number of steps, and the physics where they matter."""
+    """Return the number of steps, and MuJoCo's version where it matters."""
     physics = f" with MuJoCo {conditions.mujoco}" if conditions.mujoco else ""
     return f"{conditions.n_timesteps:,} steps{physics}"
 

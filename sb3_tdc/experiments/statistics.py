@@ -1,8 +1,8 @@
 """
 Returns of runs → the numbers of tables and figures: functions of arrays that read no file.
 
-Axes are stated in this order: runs (seeds), then bins or tasks, then episodes. A run is one seed, and the unit of
-every interval: episodes of one run say nothing about the next seed. NaN stands for "cannot be known".
+The axes are, in this order: runs (seeds), then bins or tasks, then episodes. A run is one seed, and the unit of every
+interval: episodes of one run say nothing about the next seed. NaN stands for "cannot be known".
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from scipy import integrate, stats
 
 
 def bin_edges(last_step: int, width: int) -> np.ndarray:
-    """Return (bins + 1,), multiples of ``width`` from 0 to the first that is at least ``last_step``."""
+    """Return the multiples of ``width`` from 0 to the first that is at least ``last_step``, (bins + 1,)."""
     if last_step < 1 or width < 1:
         raise ValueError(f"last_step and width must be at least 1, got {last_step} and {width}")
     return np.arange(0, -(-last_step // width) + 1) * width
@@ -20,7 +20,7 @@ def bin_edges(last_step: int, width: int) -> np.ndarray:
 
 def bin_means(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """
-    Return the mean of the values in every bin (edges[b], edges[b+1]]: step 20,000 belongs to the first 20,000.
+    Return the mean of the values in every bin (edges[b], edges[b+1]]: step 20,000 belongs to the bin that it ends.
 
     :param steps: (n,)
     :param values: (n,)
@@ -38,7 +38,7 @@ def bin_means(steps: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.nd
 
 def mean_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return the mean over runs and its confidence interval by Student's t, which is honest for the few seeds of RL.
+    Return the mean over runs and its confidence interval by Student's t, which accounts for the few seeds of RL.
 
     :param values: (runs, ...); NaN is left out
     :return: mean, low, high, each (...); the interval is NaN where there are fewer than two runs
@@ -54,10 +54,11 @@ def interval_of(
     mean: np.ndarray, std: np.ndarray, n: np.ndarray | int, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return the same of what is known by its summary.
+    Return the mean and its confidence interval, as :func:`mean_interval` does, from summary statistics.
 
+    :param mean: mean over the runs
     :param std: sample standard deviation over the runs; NaN for fewer than two
-    :param n: how many runs there are
+    :param n: number of runs
     :return: mean, low, high
     """
     half = stats.t.ppf((1 + confidence) / 2, np.maximum(n - 1, 1)) * std / np.sqrt(np.maximum(n, 1))
@@ -75,7 +76,9 @@ def final_return(returns: np.ndarray) -> float:
 
 def best_return(returns: np.ndarray) -> float:
     """
-    Return the mean of the best evaluation of one run: a maximum over noisy means flatters, the more the fewer episodes.
+    Return the mean of the best evaluation of one run.
+
+    As a maximum over noisy means, it is biased upwards: the more, the fewer episodes an evaluation has.
 
     :param returns: (evaluations, episodes)
     """
@@ -88,7 +91,7 @@ def area_under_curve(steps: np.ndarray, returns: np.ndarray) -> float:
 
     :param steps: (evaluations,), increasing
     :param returns: (evaluations, episodes)
-    :return: in units of return; of a single evaluation, its mean
+    :return: in units of return; for a single evaluation, its mean
     """
     means = returns.mean(axis=1)
     return float(integrate.trapezoid(means, steps) / (steps[-1] - steps[0])) if len(steps) > 1 else float(means[0])
@@ -114,7 +117,7 @@ def spread(values: np.ndarray) -> float:
 
 def spread_interval(values: np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
     """
-    Return the confidence interval of the standard deviation, by χ²: of normal values.
+    Return the confidence interval of the standard deviation by χ², which assumes normal values.
 
     :param values: (runs,)
     :return: low, high; NaN for fewer than two
@@ -143,9 +146,9 @@ def holm(p_values: np.ndarray) -> np.ndarray:
 
 def interquartile_mean(*tasks: np.ndarray, axis: int = -1) -> np.ndarray:
     """
-    Return the mean of the middle half of the scores of all runs on all tasks; of fewer than four scores, that of all.
+    Return the mean of the middle half of the scores of all runs on all tasks; for fewer than four scores, of all.
 
-    :param tasks: each (..., runs) along ``axis``
+    :param tasks: for every task, the scores, (..., runs) with the runs along ``axis``
     """
     return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
 
@@ -154,12 +157,13 @@ def iqm_interval(
     tasks: Sequence[np.ndarray], seed: int = 0, confidence: float = 0.95, resamples: int = 5_000
 ) -> tuple[float, float]:
     """
-    Return a stratified bootstrap of the interquartile mean: seeds are resampled within every task (percentile method).
+    Return the stratified bootstrap interval of the interquartile mean.
 
-    Of a handful of seeds, resampling knows only those: the interval is then rather too narrow.
+    Seeds are resampled within every task (percentile method). Resampling knows only the seeds at hand: with a handful
+    of them, the interval tends to be too narrow.
 
-    :param tasks: for every task (runs,) scores
-    :param seed: of the resampling
+    :param tasks: for every task, the scores, (runs,)
+    :param seed: seed of the resampling
     :return: low, high; NaN if a task has fewer than two runs
     """
     if min(map(len, tasks)) < 2:
@@ -179,8 +183,8 @@ def normalise_scores(returns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]
     """
     Return scores that can be averaged over tasks: 0 and 1 are the lowest and the highest single run on the task.
 
-    :param returns: of one task, for every algorithm (runs,)
-    :return: the same, between 0 and 1; all 0.5 if all runs are equal
+    :param returns: for every algorithm, its returns on one task, (runs,)
+    :return: for every algorithm, its scores between 0 and 1, (runs,); all 0.5 if all runs are equal
     """
     pooled = np.concatenate(list(returns.values()))
     low, width = pooled.min(), np.ptp(pooled)

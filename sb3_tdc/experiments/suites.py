@@ -1,4 +1,8 @@
-"""What the paper ran, for which of its figures, and what is run here: algorithms, tasks, and what is set otherwise."""
+"""
+Suites of runs: the paper's experiments by figure, and further experiments of this package.
+
+A suite lists algorithms and tasks, with the hyperparameters that differ from ``hyperparams/``.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,9 +19,9 @@ ISAAC = ("Isaac-Repose-Cube-Allegro-v0", "Isaac-Franka-Cabinet-Direct-v0")
 @dataclass(frozen=True)
 class Cell:
     """
-    One set of seeds.
+    One algorithm on one task with one choice of settings, to be run with several seeds.
 
-    :param settings: hyperparameters over those of ``hyperparams/``
+    :param settings: hyperparameters that override those of ``hyperparams/``
     :param n_timesteps: environment steps; None for those of ``hyperparams/``, which are the paper's
     """
 
@@ -27,7 +31,7 @@ class Cell:
     n_timesteps: int | None = None
 
     def includes(self, run: Run) -> bool:
-        """Return whether a run is of this cell: with its settings, and otherwise as ``hyperparams/`` has it."""
+        """Return whether a run, of any length, has the cell's settings and otherwise those of ``hyperparams/``."""
         return (
             (run.algo, run.env_id) == (self.algo, self.env_id)
             and all(run.setting(key) == value for key, value in self.settings.items())
@@ -58,23 +62,23 @@ _STEPS = 300_000
 _TASKS = ("Hopper-v4", "HalfCheetah-v4", "Walker2d-v4")
 _TABLE_1: tuple[str, dict[str, Any]] = ("tdc", {})
 
-# Fewer steps than the paper's, so that two cores complete them in days
+# Fewer steps than in the paper, so that two cores complete these runs in days
 EVIDENCE: dict[str, list[Cell]] = {
     "evidence": _shorter(_STEPS, _TASKS, _TABLE_1, ("td3", {}), ("sac", {}), ("tdc", {"lam": 0.0})),
     "evidence-heads": _shorter(_STEPS, _TASKS, ("meow", {}), ("tdc", {"stochastic_actor": True})),
     "pybullet": _shorter(100_000, PYBULLET, _TABLE_1, ("sac", {})),
     "evidence-long": _shorter(1_000_000, ("Hopper-v4",), _TABLE_1, ("td3", {})),
-    # What keeps Hopper at a return of 300 for so long? Against the first suite's TDC and TD3, one thing changed in each
+    # What keeps Hopper at a return of 300 for so long? Each cell changes one thing in TDC or TD3 of the first suite
     "hopper": _shorter(
         _STEPS,
         ("Hopper-v4",),
-        ("td3", {"learning_starts": 25_000}),  # with this, all is as in the original code of TD3
+        ("td3", {"learning_starts": 25_000}),  # with this, everything is as in TD3's original code
         ("tdc", {"learning_starts": 25_000}),
         ("tdc", {"kappa": 10.0}),
         ("tdc", {"learning_rate": 3e-4, "qf_learning_rate": 3e-4}),
     ),
 }
-# What λ does, whether it should tune itself, and what else could be
+# What λ does, whether it should tune itself, and what else λ and κ could be (docs/lambda.md)
 LAMBDA: dict[str, list[Cell]] = {
     "lambda": _shorter(
         100_000,

@@ -1,4 +1,4 @@
-"""Tables: groups of runs → numbers (for CSV) → cells to read (for the report)."""
+"""Tables: groups of runs → numbers (for CSV) → formatted cells (for the report)."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ _PUBLISHED = Path(__file__).with_name("published.yml")
 
 
 def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """Make one row for each group with a finished run, in units of return; NaN where one seed says nothing."""
+    """Make one row for each group with a finished run, in units of return; NaN for what one seed cannot tell."""
     rows = []
     for group in groups:
         curves = [run.evaluations for run in group.finished if run.evaluations is not None]
@@ -66,7 +66,7 @@ def make_returns_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def show_returns(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table of numbers as cells to read."""
+    """Format the table of :func:`make_returns_table` for the report."""
     rows = []
     for row in table.to_dict("records"):
         interval = (
@@ -98,9 +98,11 @@ def show_returns(table: pd.DataFrame) -> pd.DataFrame:
 
 def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
     """
-    List our final returns, then what others have published, one row for each source and algorithm.
+    List our final returns and those that others have published, one row for each source and algorithm.
 
-    :param table: of :func:`make_returns_table`
+    Rows are grouped by algorithm, with ours first in each group.
+
+    :param table: the table of :func:`make_returns_table`
     """
     rows = []
     ours = [row for row in table.to_dict("records") if row["environment"].rpartition("-")[0] in TASKS]
@@ -142,7 +144,7 @@ def make_published_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """List ours after their last step, then each published algorithm after as many, by task and number of steps."""
+    """List our final returns, then the published curves at the same step, by task and number of steps."""
     rows = []
     for conditions, alike in by_conditions((g for g in groups if g.finished), MUJOCO).items():
         published = [(curve, *curve.at(conditions.n_timesteps)) for curve in published_curves(conditions.env_id)]
@@ -157,7 +159,7 @@ def make_published_curves_table(groups: Sequence[Group]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["Environment", "Steps", "Algorithm", "Return", "Seeds"])
 
 
-# What λ does: a column of the log, its title, and by what it is multiplied to be read
+# What λ does: a column of the log, its title in the table, and the factor that it is multiplied by
 _LAM_COLUMNS = (
     ("train/lam", "λ", 1),
     ("train/lam_can_change", "λ* exists, %", 100),
@@ -175,7 +177,7 @@ _LAM_COLUMNS = (
 
 
 def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """Make one row for each group that logs what λ does: means over the last third of every run, and over its seeds."""
+    """Make one row for each group that logs what λ does: means over the last third of every run, then over seeds."""
     rows = []
     for group in groups:
         logged = {title: _late_means(group.finished, column) * unit for column, title, unit in _LAM_COLUMNS}
@@ -195,12 +197,12 @@ def make_lam_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def _late_means(runs: Sequence[Run], column: str) -> np.ndarray:
-    """Return (runs,), NaN where a run has not logged it"""
+    """Return the mean of a column in the last third of every run, (runs,); NaN where a run has not logged it."""
     return np.array([late.mean() if len(late := run.late(column)) else np.nan for run in runs])
 
 
 def _over_seeds(values: np.ndarray) -> str:
-    """Return ``"87.2 ± 35"``; without a ± where there is one seed, or all have the same value."""
+    """Return ``"87.2 ± 35"``; without the ± if there is one seed, or all seeds have the same value."""
     known = values[np.isfinite(values)]
     if not len(known):
         return "–"
@@ -219,7 +221,7 @@ def _with_interval(mean: float, low: float, high: float) -> str:
 
 
 def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """Make one row for each comparison that a claim of the paper asks for, with its verdict."""
+    """Make one row for each comparison that a claim of the paper requires, with its verdict."""
     rows = [
         {
             "Claim": claim.says,
@@ -236,7 +238,7 @@ def make_claims_table(groups: Sequence[Group]) -> pd.DataFrame:
 
 
 def make_comparisons_table(comparisons: Sequence[Comparison]) -> pd.DataFrame:
-    """Make one row for each variant next to its control."""
+    """Make one row for each variant and its control."""
     return pd.DataFrame(
         [
             {
@@ -271,7 +273,7 @@ def number(value: float) -> str:
 
 
 def plus_minus(mean: float, std: float) -> str:
-    """Return ``"1,234 ± 56"``, without a ± of one seed."""
+    """Return ``"1,234 ± 56"``, without the ± if the standard deviation is NaN."""
     return number(mean) if np.isnan(std) else f"{number(mean)} ± {number(std)}"
 
 
@@ -282,7 +284,7 @@ def _published_return(value: Any) -> str:
 
 
 def _per_task(values: dict[str, str]) -> str:
-    """Return one value if all tasks that have one have the same, else those of all, in the order of the columns."""
+    """Return the common value if all tasks that have one agree, else all values in the order of the columns."""
     if len(set(values.values())) == 1:
         return next(iter(values.values()))
     return " / ".join(values.get(task, "–") for task in TASKS)
@@ -290,8 +292,12 @@ def _per_task(values: dict[str, str]) -> str:
 
 def _rows_over_tasks(rows: list[dict[str, Any]]) -> Iterator[tuple[tuple[str, str], list[dict[str, Any]]]]:
     """
-    Put tasks into one row: of one algorithm, version and physics, and of one length, which is a number of steps or a
-    share of those in ``hyperparams/``, whichever makes fewer rows.
+    Yield the tasks of each row, which have the same algorithm, version, physics and length.
+
+    Equal length means the same number of steps, or the same share of the steps in ``hyperparams/``, whichever makes
+    fewer rows.
+
+    :return: the algorithm and the version (with the physics), and the rows of these tasks
     """
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:

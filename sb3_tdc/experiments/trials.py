@@ -12,7 +12,7 @@ from sb3_tdc.common.words import count
 from sb3_tdc.experiments.jobs import Job, eval_freq, stop
 from sb3_tdc.experiments.results import Run
 
-_POLL_SECONDS = 1.0  # a look reads the files of a run, which takes time from the training
+_POLL_SECONDS = 1.0  # each poll reads the files of the runs, which takes time from training
 
 
 _LONGEST_STEP_SECONDS = 5.0
@@ -22,8 +22,8 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
     """
     Make the class of a trial.
 
-    :param tune: the module of Ray
-    :param trials: by name, the jobs that run side by side: one seed, or all of a candidate
+    :param tune: the module ``ray.tune``
+    :param trials: by name, the jobs that run side by side: one seed, or all seeds of a candidate
     :return: the class of a trial
     """
 
@@ -34,7 +34,7 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
             self.processes = [job.start() for job in self.jobs if not job.is_finished]
 
         def step(self) -> dict[str, Any]:
-            """Wait for the next evaluation of all seeds, not for long: only between steps can a trial be stopped."""
+            """Wait for the next evaluation of all seeds, but not long: Ray can stop a trial only between steps."""
             deadline = time.monotonic() + _LONGEST_STEP_SECONDS
             while True:
                 has_ended = all(process.poll() is not None for process in self.processes)
@@ -77,12 +77,12 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
     """
     Run trials on Ray Tune.
 
-    :return: whether the search came to its end, and what went wrong with the trials that failed
+    :return: whether all trials ended, and the errors of those that failed
     """
     from ray import tune
     from ray.tune.schedulers import ASHAScheduler
 
-    if not args.asha:  # ASHA needs all of them, to compare: a finished one reports at once what it has
+    if not args.asha:  # ASHA compares all trials: finished ones report at once
         trials = {name: jobs for name, jobs in trials.items() if not all(job.is_finished for job in jobs)}
     if not trials:
         return True, []
@@ -92,9 +92,9 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
         max_t=args.n_timesteps,
         grace_period=max(args.n_timesteps // 9, 1),
         reduction_factor=3,
-        stop_last_trials=False,  # after its last evaluation, a run has its model to write
+        stop_last_trials=False,  # after its last evaluation, a run still has to write its model
     )
-    # Also of a resumed search: all that is needed is in the folders of the runs, and Ray's state would be unpickled
+    # Also for a resumed search: the folders of the runs hold all that it needs, while Ray's state would be unpickled
     tuner = tune.Tuner(
         tune.with_resources(make_trainable(tune, trials), {"cpu": n_cpus}),
         param_space={"trial": tune.grid_search(list(trials))},
@@ -105,12 +105,12 @@ def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) ->
             name="ray",
             storage_path=str(args.folder),
             verbose=1,
-            checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),  # the runs have their own
+            checkpoint_config=tune.CheckpointConfig(checkpoint_at_end=False),  # the runs have their own resume states
         ),
     )
     results = tuner.fit()
     failed = [str(error).strip().splitlines()[-1] for error in results.errors]
-    # Not Ray's states: after a Ctrl-C it calls all trials terminated, also those that it never began
+    # Ray's own trial states do not tell: after a Ctrl-C, all are "terminated", even those of trials that never began
     ended = [result for result in results if result.error is not None or (result.metrics or {}).get("done")]
     return len(ended) == len(trials), failed
 
@@ -122,8 +122,8 @@ def make_trials(
     Group jobs into trials, by name.
 
     :param searched: names of hyperparameters; their values name the trials
-    :param side_by_side: all seeds of a candidate in one trial: what stops a trial then stops a candidate, not its bad
-        seeds, which would leave a mean of the lucky ones
+    :param side_by_side: put all seeds of a candidate into one trial. A scheduler then stops whole candidates; stopping
+        only their bad seeds would leave the mean of the lucky ones
     """
 
     def name(job: Job, seeds: str) -> str:

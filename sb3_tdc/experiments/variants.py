@@ -1,9 +1,10 @@
 """
-Variants, each against the control that it is a change of: does it help?
+Variants, each compared with the control that it changes: does the change help?
 
-Compared is the mean of a run's evaluations in its last third, fixed before any run was made: less noisy than the last
-evaluation. Differences have Welch's interval over seeds; a verdict needs a p-value below 5 % after Holm's correction
-for the number of variants with several seeds, under the same conditions (task, number of steps, MuJoCo).
+The compared quantity, chosen before any run was made, is the mean of a run's evaluations in its last third, which is
+less noisy than the last evaluation. Differences have Welch's interval over seeds. A verdict needs a p-value below 5 %
+after Holm's correction for the number of variants with several seeds, under the same conditions (task, number of
+steps, MuJoCo).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +27,7 @@ from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.tdc import TDC
 
 _LEVEL = 0.05
-# What an entry of hyperparams/ says of training, apart from the constructor's arguments
+# The keys of an entry of hyperparams/ that describe training, apart from the constructor's arguments
 _OF_TRAINING = ("noise_type", "noise_std", "n_envs", "normalize")
 _NAMES = {cls: name for name, cls in {"tdc": TDC, **ABLATIONS}.items()}
 
@@ -41,9 +42,9 @@ class Comparison:
     """
     A variant and its control.
 
-    :param returns: (seeds with evaluations in the last third,) of the variant and of the control
+    :param returns: late returns of the variant and of the control, each (seeds with evaluations in the last third,)
     :param difference: of the means, variant − control, with its 95 % interval; NaN where there are too few seeds
-    :param p: corrected for the number of variants; NaN where there are too few seeds, or all returns are equal
+    :param p: p-value, corrected for the number of variants; NaN for too few seeds, or if all returns are equal
     """
 
     variant: Group
@@ -64,10 +65,10 @@ class Comparison:
 
 def compare_variants(groups: Sequence[Group]) -> list[Comparison]:
     """
-    Return the comparisons under all conditions.
+    Return the comparisons of variants of TDC with their controls, under all conditions.
 
-    λ, fixed or calibrated (``tdc-auto``), is compared with λ = 0, and another ablation with the algorithm that it
-    derives from, with the same hyperparameters.
+    λ, fixed or calibrated (``tdc-auto``), is compared with λ = 0. Every other ablation is compared with the algorithm
+    that it derives from. Control and variant have the same other hyperparameters.
     """
     return _compare_all(groups, _variants)
 
@@ -76,8 +77,8 @@ def compare_settings(groups: Sequence[Group]) -> list[Comparison]:
     """
     Return the comparisons of other hyperparameters with those of ``hyperparams/``, under all conditions.
 
-    Without λ and the head, which have their own, and without groups whose task or beginning is another: with arguments
-    of the environment, wrappers, or a trained model.
+    Groups that differ only in λ or the head are left out: these have their own sections. So are groups with another
+    task or another start, through arguments of the environment, wrappers, or a trained model.
     """
     return _compare_all(groups, _other_settings)
 
@@ -86,9 +87,9 @@ def _compare_all(
     groups: Sequence[Group], pairs: Callable[[Sequence[Group]], Iterator[tuple[Group, Group]]]
 ) -> list[Comparison]:
     """
-    Compare pairs under all conditions; those under the same ones are a family of Holm's correction.
+    Compare pairs under all conditions; the pairs under the same conditions are one family of Holm's correction.
 
-    :param pairs: finished groups under the same conditions → variants with their controls
+    :param pairs: finished groups under the same conditions → pairs of variant and control
     """
     found = []
     for alike in by_conditions(group for group in groups if group.finished).values():
@@ -123,7 +124,7 @@ def _is_control(control: Group, variant: Group) -> bool:
 
 
 def _compare(variant: Group, control: Group) -> Comparison:
-    """Compare, with the p-value of this comparison alone."""
+    """Compare a variant with its control; the p-value is not corrected."""
     ours, others = variant.late_returns, control.late_returns
     mean = statistics.mean(ours) - statistics.mean(others)
     if min(len(ours), len(others)) < 2:
