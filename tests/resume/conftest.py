@@ -1,4 +1,4 @@
-"""A run left alone, and one that was stopped."""
+"""Fixtures: an uninterrupted run, and one that was stopped."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture
 def stop_at(monkeypatch):
-    """A signal in the middle of a step."""
+    """Send SIGTERM to this process in the middle of a given step."""
 
     def set_up(step):
         original = ProgressCallback._on_step

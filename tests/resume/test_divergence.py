@@ -1,4 +1,4 @@
-"""Nothing that is not finite is learnt from or saved, and a run can go back to before it diverged."""
+"""Non-finite numbers are never learnt from or saved, and a run can go back to a state from before it diverged."""
 
 import re
 
@@ -18,7 +18,11 @@ from tests.tools.runs import Stop, StopAt
 
 
 class Breaks(gym.Env):
-    """An environment with episodes of 10 steps that returns one extreme value at step 57."""
+    """
+    An environment with episodes of 10 steps that returns an extreme value at step 57.
+
+    A terminal observation is extreme at step 60, where that episode ends; a reset, at the beginning or after that step.
+    """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
@@ -55,7 +59,7 @@ def run_train(folder, algo, *args):
 
 
 def numbers_of(folder):
-    """Every number of every model and state of a run, of infinite bounds and best returns apart."""
+    """Yield weights, optimizer states and transitions in resume states. Bounds and best returns may be infinite."""
     for path in folder.rglob("weights.pt"):
         for name, state in th.load(path, weights_only=True)["state_dicts"].items():
             for value in state["state"].values() if name.endswith("optimizer") else [state]:
@@ -89,7 +93,7 @@ def test_every_algorithm_ends_with_a_sentence_and_saves_nothing_that_is_not_fini
 
 @pytest.mark.parametrize("algo", ["td3", "sac", "ddpg"])
 def test_weights_that_diverge_are_not_saved(tmp_path, capsys, monkeypatch, algo):
-    """In the last update, of which no step tells."""
+    """In the last update: no step after it can notice."""
     algorithm = {"td3": TD3, "sac": SAC, "ddpg": TD3}[algo]
     learn = algorithm.train
 
@@ -108,7 +112,7 @@ def test_weights_that_diverge_are_not_saved(tmp_path, capsys, monkeypatch, algo)
 
 @pytest.mark.parametrize("algo", ["td3", "sac", "ddpg"])
 def test_weights_that_diverge_in_training_are_named(tmp_path, capsys, monkeypatch, algo):
-    """SAC's distribution raises an error of its own then."""
+    """With such weights, SAC's distribution raises an error itself."""
     algorithm = SAC if algo == "sac" else TD3
     learn = algorithm.train
 
@@ -217,7 +221,7 @@ def test_a_run_goes_back_with_other_hyperparameters_and_the_change_is_recorded(t
     assert rates(folder, 59) == {0.00123}
     assert rates(folder, 0) != {0.00123}
 
-    # From a state that is older than the change, by a command that does not say it again
+    # From a state written before the change, by a command that does not repeat the change
     stop[0] = 45
     assert resume("--from", "20") == 1
     assert rates(folder, 39) == {0.00123}
@@ -232,7 +236,7 @@ def _finite_step(self, action):
 
 
 def _stop_at(monkeypatch, step):
-    """As sudden as a kill."""
+    """Stop as suddenly as a kill. :return: the step, in a list so that a test can change it"""
     stop = [step]
     on_step = ResumeCallback._on_step
 

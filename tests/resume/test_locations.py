@@ -29,7 +29,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A run that was stopped, written by a relative path; the working directory is another one by now."""
+    """The folder above a stopped run, which was given by a relative path; the working directory has changed since."""
     (tmp_path / "there").mkdir()
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "there")
@@ -141,7 +141,7 @@ def outcome_without_events(folder):
 
 
 class Notes(BaseCallback):
-    """A user's callback that keeps locations, and texts that are none."""
+    """A user's callback that keeps locations, and texts that are not locations."""
 
     def __init__(self, folder):
         super().__init__()
@@ -186,7 +186,7 @@ def test_what_was_built_with_another_location_stays_as_it_is_built_now(tmp_path,
         "rl_model_75_steps.zip",
         "rl_model_100_steps.zip",
     }
-    # What lies in the run's folder moves with it, also where it changed in the run; elsewhere, what changed stays
+    # A location in the run's folder moves with it, even if it changed during the run; any other that changed stays
     assert (inside.folder, inside.path) == (str(tmp_path / "moved"), tmp_path / "moved")
     names = ["start.txt", *(f"{step}.txt" for step in range(1, 101))]
     assert inside.newest["files"] == [str(tmp_path / "moved" / name) for name in names]
@@ -264,7 +264,7 @@ class Means(BaseCallback):
 
 
 def learn_with_columns(folder, stop_at=None):
-    """:return: the columns of ``progress.csv``, its rows without the times, and the means"""
+    """:return: the columns of ``progress.csv``, by name and without the times, and the names of the means"""
     small = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 200, "learning_starts": 5, "batch_size": 4}
     model = SAC("MlpPolicy", gym.make("Pendulum-v1", max_episode_steps=20), seed=1, device="cpu", **small)
     model.set_logger(configure(str(folder), ["csv"]))

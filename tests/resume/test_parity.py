@@ -42,7 +42,11 @@ def run_process(mode, folder, names):
 
 
 def differences(folder, names):
-    """Three processes: never stopped, stopped, resumed."""
+    """
+    Run cases in three processes: never stopped, stopped, resumed.
+
+    :return: for each case, the fingerprints that differ; and all fingerprints of the runs that were never stopped
+    """
     for mode in ("whole", "stopped", "resumed"):
         run_process(mode, folder, names)
     whole, resumed = (json.loads((folder / f"{mode}.json").read_text()) for mode in ("whole", "resumed"))
@@ -54,7 +58,7 @@ def differences(folder, names):
 
 @pytest.fixture(scope="module")
 def quick(request, tmp_path_factory):
-    """Of the selected tests, together: a process takes seconds to start."""
+    """Run the cases of all selected tests together, as a process takes seconds to start."""
     selected = [item for item in request.session.items if "quick" in getattr(item, "fixturenames", ())]
     return differences(tmp_path_factory.mktemp("parity"), [item.callspec.params["name"] for item in selected])
 
@@ -76,7 +80,7 @@ def test_the_whole_cross(tmp_path):
 @pytest.mark.skipif(not HAS_PYBULLET, reason="needs PyBullet, which has wheels for Python 3.11 and older only")
 @pytest.mark.parametrize("name", ["Thrower", "Pusher", "HumanoidFlagrunHarder"])
 def test_a_world_that_pybullet_does_not_save_whole_is_not_captured(name):
-    """A thrown ball, a pushed cylinder, a cube that attacks: from PyBullet's own file, they move elsewhere."""
+    """Restored from PyBullet's own file, a thrown ball, a pushed cylinder and an attacking cube move differently."""
     env = DummyVecEnv([bullet(f"{name}BulletEnv-v0")])
     (state,) = capture_vec_env(Capture(KINDS), env, "env")[0]
     assert "PyBullet does not save all of a world in which" in state["why"]

@@ -1,4 +1,4 @@
-"""``train.py --resume`` and ``ResumeCallback``: what a user sees when a run is stopped, damaged, or not what it was."""
+"""``train.py --resume`` and ``ResumeCallback``: what a user sees when a run is stopped, damaged, or changed."""
 
 import errno
 import functools
@@ -46,7 +46,7 @@ def test_a_signal_loses_nothing(tmp_path, stop_at, monkeypatch, whole, capsys):
     monkeypatch.undo()
     stopped = tmp_path / "tdc" / "Hopper-v4_1"
     screen = capsys.readouterr().out
-    assert "Stopped at step 271 of 400." in screen  # the step after, which is done again
+    assert "Stopped at step 271 of 400." in screen  # the step after the signal; the resumed run repeats it
     assert "To continue from step 270:" in screen
     assert f"sb3-tdc train --resume {stopped}" in screen
     assert resume(stopped) == 0
@@ -54,11 +54,15 @@ def test_a_signal_loses_nothing(tmp_path, stop_at, monkeypatch, whole, capsys):
     assert "Resuming tdc on Hopper-v4, seed 1" in screen
     assert "Continuing from step 270" in screen
     assert outcome(stopped) == whole
-    assert not (stopped / "resume").exists()  # of no use any more
+    assert not (stopped / "resume").exists()  # no longer needed
 
 
 def test_a_run_on_a_busy_machine_goes_on_with_another_number_of_threads(tmp_path, monkeypatch, whole):
-    """Stopped when it says that one thread is faster. The threads are told, not changed, so that the results stay."""
+    """
+    A run is stopped when it says that one thread is faster, and continues with one.
+
+    The number of threads is only recorded, not set: a real change could alter the results.
+    """
     threads, messages = [2], []
 
     def say(progress, text):
@@ -77,8 +81,8 @@ def test_a_run_on_a_busy_machine_goes_on_with_another_number_of_threads(tmp_path
         stopped = tmp_path / "tdc" / "Hopper-v4_1"
         shutil.copytree(stopped, tmp_path / "copy")
         assert resume(tmp_path / "copy") == 0
-        assert len(messages) == 2  # a process does not know what the one before has said
-    time.sleep(1)  # TensorBoard reads the files of one process and one second in the order of their names: 10 before 8
+        assert len(messages) == 2  # a process does not know what the previous one has said
+    time.sleep(1)  # TensorBoard sorts the files of one process and one second by name: 10 before 8
     with pytest.warns(RuntimeWarning, match="threads of torch was 2, is 1"):
         assert resume(stopped, "--num-threads", "1") == 0
     assert outcome(stopped) == whole
@@ -101,7 +105,7 @@ def test_a_finished_run_starts_over(tmp_path, monkeypatch):
     save = training._save
     monkeypatch.setattr(training, "_save", lambda *args: before.append(mark.exists()) or save(*args))
     assert resume(folder, "--start-over") == 0
-    assert before == [False]  # killed until then, it would be unfinished
+    assert before == [False]  # a run killed before this counts as unfinished
     assert mark.exists()
     assert outcome(folder) == first
 
@@ -144,7 +148,7 @@ def test_schedules_follow_the_new_length(stopped, capsys):
 
 
 def test_a_run_of_rl_zoo_has_the_length_of_its_flag(tmp_path, capsys):
-    """It keeps ``-n`` out of its hyperparameters."""
+    """RL Zoo keeps ``-n`` out of its hyperparameters."""
     assert run_train(tmp_path, n=150) == 0
     run = RunFolder.open(tmp_path / "tdc" / "Hopper-v4_1")
     folder = run.path / "Hopper-v4"
@@ -265,7 +269,7 @@ def test_the_same_arguments_are_no_contradiction(stopped, whole):
 
 
 def test_a_full_disk_stops_nothing_but_the_state(tmp_path, whole, monkeypatch, stop_at):
-    """From step 100 to 250 nothing can be synced: no state is written, and the one before stays."""
+    """From step 100 to 250 nothing can be synced: no state is written, and the previous one stays."""
     folder = tmp_path / "tdc" / "Hopper-v4_1"
     write = ResumeCallback._write
 
@@ -312,7 +316,7 @@ def test_a_signal_does_not_wait_for_the_end_of_an_endless_episode(tmp_path, caps
 
 
 def test_several_kills(tmp_path):
-    """Fewer than ``python -m tests.tools.kill`` makes."""
+    """Fewer kills than ``python -m tests.tools.kill`` makes by default."""
     assert kill.main(["--kills", "3", "--steps", "3000", "--longest", "0.4", "--folder", str(tmp_path)]) == 0
 
 
@@ -385,7 +389,7 @@ def test_another_platform_is_named(tmp_path, monkeypatch):
 
 
 class Locked(PendulumEnv):
-    """Python cannot see into a lock, so this cannot be captured."""
+    """An environment that cannot be captured, as Python cannot see into its lock."""
 
     def __init__(self):
         super().__init__()
@@ -421,7 +425,7 @@ def test_an_environment_that_cannot_be_captured_starts_its_episode_again(tmp_pat
     assert seen["updates"] > 0
     assert all((part == 1).all() for part in seen["last"])  # cut off there, as by a time limit
     assert model.num_timesteps == 150
-    # The generators go on: this is not the first episode again
+    # The random generators continue: this is not the first episode again
     assert not np.isclose(seen["observations"], make().env.reset()).all(axis=-1).any()
 
 
@@ -435,7 +439,7 @@ def test_processes_without_the_wrapper_are_told_about_it(tmp_path):
 
 
 def cyclic():
-    """A tuple that contains itself, through a partial: it cannot be made piece by piece."""
+    """Return a list that contains itself through a tuple, next to an iterator, which cannot be captured."""
     parts = []
     parts.append((parts, iter(())))
     return parts
@@ -465,7 +469,7 @@ def test_arguments_out_of_range(tmp_path):
 
 
 def test_nothing_is_pickled(tmp_path):
-    """Every file is JSON, arrays without objects, or weights; a pickle that was put in their place is not executed."""
+    """Every file is JSON, arrays without objects, or weights; a pickle put in the place of one is not executed."""
     learn(make_model(), tmp_path, stop_at=70)
     kinds = {path.suffix for path in tmp_path.rglob("*") if path.is_file()} - {""}
     assert kinds == {".json", ".npz", ".pt"}
@@ -491,19 +495,20 @@ def test_nothing_is_pickled(tmp_path):
 
 
 def _digest_of(folder, path):
-    """As if the manifest had been forged too."""
+    """Return the SHA-256 that the manifest states, as if it had been forged too."""
     manifest = json.loads((folder / "manifest").read_text().splitlines()[0])
     known = {**manifest["files"], **manifest["shared"]}
     return known.get(path.name, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def test_what_is_written_is_what_was_added(tmp_path):
-    """Bytes in proportion to the transitions since the last state; the ring's old parts go."""
+    """Each state adds bytes in proportion to its new transitions; overwritten parts of the ring are removed."""
     model = make_model(buffer_size=200)
     learn(model, tmp_path, steps=1000)
     segments = sorted((tmp_path / "replay").iterdir())
     sizes = [path.stat().st_size for path in segments]
     assert max(sizes) < 1.1 * min(sizes)
-    # 200 transitions, 20 a state, for the two newest, one 10 to 20 states older, and the next of these
+    # A segment holds 20 transitions, so 10 segments hold the ring of 200. Four states stay, with the segments that they
+    # need: the two newest, one that is 10 to 20 states older, and the one that will replace it
     assert 20 <= len(segments) <= 32
     assert len(list(tmp_path.glob("step_*"))) == 4

@@ -1,4 +1,4 @@
-"""What a run shows, and what it says of what it cannot restore."""
+"""What a run prints, and the warnings about values that it cannot restore."""
 
 import threading
 import warnings
@@ -50,7 +50,7 @@ def test_tables_on_the_screen_are_no_part_of_the_state(tmp_path, monkeypatch, ca
 
 
 def test_the_tables_of_sb3_need_no_warning(tmp_path):
-    """As with ``verbose=1``."""
+    """The tables that SB3 prints with ``verbose=1``."""
     model = TDC("MlpPolicy", "Pendulum-v1", verbose=1, buffer_size=100, policy_kwargs={"net_arch": [8]}, device="cpu")
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
@@ -58,7 +58,7 @@ def test_the_tables_of_sb3_need_no_warning(tmp_path):
 
 
 class Locks(PendulumEnv):
-    """Holds what Python cannot see into."""
+    """An environment that holds a lock, which Python cannot see into."""
 
     def __init__(self, render_mode=None):
         super().__init__(render_mode)
@@ -73,7 +73,7 @@ def said(caught):
 
 
 def test_one_cause_is_one_sentence(tmp_path, monkeypatch):
-    """Also where it is in every environment, of training and of evaluation."""
+    """Also where the cause is in every environment, of training and of evaluation."""
     cause = "env[1].env.env.env.env.lock is a _thread.lock"
     left_out = f"Not in the resume states: env, environment 0 (and 3 others): {cause}"
     with monkeypatch.context() as patch:

@@ -1,4 +1,4 @@
-"""ResumeCallback on disk: whole or not at all, and what happens to those that are damaged."""
+"""The states of ``ResumeCallback`` on disk: each is there whole or not at all, and damaged ones are passed over."""
 
 import errno
 import os
@@ -88,7 +88,7 @@ def test_any_flipped_bit_of_a_manifest_is_noticed(store):
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_an_interruption_at_any_instant_leaves_the_one_before(store, monkeypatch, call):
-    """Every sync and every rename is one at which the process could be killed."""
+    """The process could be killed at every sync and at every rename."""
     write(store, 1)
     original = getattr(os, call)
     for instant in range(20):
@@ -147,7 +147,7 @@ def test_one_process_at_a_time(store):
 
 
 def test_in_one_process_the_newest_has_the_folder(store):
-    """As when a cell of a notebook is run again: nothing has closed the first."""
+    """As when a cell of a notebook is run again: nothing has closed the first store."""
     write(store, 1)
     second = Store(store.folder, 2, 0)
     write(second, 2)
@@ -157,9 +157,9 @@ def test_in_one_process_the_newest_has_the_folder(store):
         store.remove_all()
     assert second.steps() == [2, 1]
     second.close()
-    assert store.open_again(["ring_2"])  # the first may go on as soon as the second is done
+    assert store.open_again(["ring_2"])  # the first may write again as soon as the second is closed
     assert store.newest().step == 2
-    third = Store(store.folder, 2, 0)  # of those that are open, the first had it last
+    third = Store(store.folder, 2, 0)  # takes the folder from the first, which had it last
     with pytest.raises(LockedError):
         store.open_again()
     third.close()

@@ -1,4 +1,8 @@
-"""What may happen to a run besides a kill: signals to its group, a full disk, removed folders, edited files, clocks."""
+"""
+What may happen to a run besides a kill.
+
+Signals to its group, a full disk, removed folders, edited files, clocks that are set back, environments that fail.
+"""
 
 import errno
 import multiprocessing
@@ -76,14 +80,14 @@ def test_a_second_ctrl_c_interrupts_and_a_second_sigterm_does_not(monkeypatch):
     stop = StopOnSignalCallback()
     with stop:
         os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)  # of the same key: to the group and to the process
+        os.kill(os.getpid(), signal.SIGINT)  # of the same key press: one to the group, one to the process
         now[0] += 1
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
 
 
 class Dies(PendulumEnv):
-    """Cannot be made in the second process."""
+    """An environment that cannot be made in the second process."""
 
     def __init__(self):
         super().__init__()
@@ -206,7 +210,7 @@ def test_an_evaluation_that_cannot_be_written_is_named_and_training_continues(tm
 
 @pytest.fixture
 def at_step(monkeypatch):
-    """Do something in the middle of a run."""
+    """Call an action in the middle of a given step."""
 
     def set_up(step, action):
         original = ProgressCallback._on_step
@@ -310,7 +314,7 @@ def test_a_clock_that_was_set_back_does_not_fold_the_curve(tmp_path, stop_at, mo
 
 
 class Raises(PendulumEnv):
-    """:param how: what goes wrong at step ``at`` of the process"""
+    """:param how: what goes wrong from step ``at`` of this environment on; "reset": at every reset"""
 
     def __init__(self, how="raise", at=250):
         super().__init__()
@@ -374,7 +378,7 @@ def test_an_environment_that_fails_is_one_sentence_and_the_run_can_be_resumed(tm
         assert f"The traceback is in {folder / 'Raises-v0' / 'error.txt'}" in error
         assert "Traceback" in (folder / "Raises-v0" / "error.txt").read_text()
     assert stored_steps(folder / "resume")[0] == 240
-    assert resume(folder, "--verbose", 0) == 1  # and again, ten steps later
+    assert resume(folder, "--verbose", 0) == 1  # it fails again, ten steps later
 
 
 @pytest.mark.parametrize(
@@ -382,7 +386,7 @@ def test_an_environment_that_fails_is_one_sentence_and_the_run_can_be_resumed(tm
     [
         ("raise", "--eval-freq -1", "step 118: step() raised ZeroDivisionError: in the simulator ("),
         ("killed", "--eval-freq -1", "step 118: the process of environment 0 was ended by SIGKILL"),
-        ("die", "--eval-freq 50", "step 50: the process of environment 0 ended with exit status 3"),  # the evaluation's
+        ("die", "--eval-freq 50", "step 50: the process of environment 0 ended with exit status 3"),  # in an evaluation
     ],
 )
 def test_a_process_of_an_environment_that_fails_is_named(tmp_path, how, arguments, reason):

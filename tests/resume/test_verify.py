@@ -1,4 +1,4 @@
-"""What a callback holds comes back as it was, its class too, or is named; nothing of it ends training."""
+"""The values of a callback come back as they were, with their classes, or are named; none of them ends training."""
 
 import io
 import json
@@ -62,9 +62,11 @@ def model():
 
 def there_and_back(model, before, after):
     """
-    As in two processes: what is built holds ``before``; what is captured, ``after``.
+    Capture a callback and restore it, as in two processes.
 
-    :return: what the second process holds in the end, and all that was named
+    :param before: recipes of the two values that the callback is built with, in both processes
+    :param after: recipes of the two values that it holds when it is captured
+    :return: the values captured, the values in the second process in the end, and the sentences on what was left out
     """
     first = Holds(*build_both(before))
     root = CallbackList([first])
@@ -82,7 +84,7 @@ def there_and_back(model, before, after):
         numbered = [arrays[str(i)] for i in range(len(arrays.files))]
     context = state.restoring(model, numbered)
     state.restore_state(model, root, json.loads(text), context)
-    assert context.not_restored == []  # it was known when it was captured
+    assert context.not_restored == []  # all that will not be restored is known when it is captured
     return now, [second.x, second.y], named
 
 
@@ -107,7 +109,7 @@ def test_whatever_a_callback_holds_comes_back_or_is_named(model, before, after):
         return
     original = build_both(before)
     for name, value, found, built in zip("xy", now, restored, original, strict=True):
-        # What one attribute shares with the other may be reached by it alone
+        # Compared one by one: where one attribute is left out, the other no longer shares objects with it
         if any(re.match(rf"callbacks\.callbacks\[0\]\.{name}\b|.* share their memory", why) for why in named):
             continue
         assert alike(value, found), (named, built)
@@ -116,7 +118,7 @@ def test_whatever_a_callback_holds_comes_back_or_is_named(model, before, after):
 @pytest.mark.parametrize("leaf", LEAVES)
 @pytest.mark.parametrize("before", ["None", "list", "itself"])
 def test_every_kind_comes_back_or_is_named(model, leaf, before):
-    """Where there was nothing, in a list that grows, and where there was the same."""
+    """In the place of None, in a list that grows, and in the place of the same value."""
     now, there = {"None": (leaf, "None"), "list": (("list", [leaf, leaf]), ("list", [])), "itself": (leaf, leaf)}[
         before
     ]
@@ -125,7 +127,7 @@ def test_every_kind_comes_back_or_is_named(model, leaf, before):
     assert all(why.startswith("callbacks.callbacks[0].x") for why in named)
 
 
-# Those that a user may expect to be kept, also where there was nothing when the run began
+# What a user may expect to be kept, even if it was not there when training began
 KEPT = ["path", "numpy's type", "torch's type", "device", "missing lists", "counted", "array", "tensor", "parameter"]
 KEPT += ["tensor with a gradient", "red", "path keys", "a large integer", "complex", "surrogates", "other generator"]
 KEPT += ["structured", "objects in an array", "cyclic", "int", "long integers", "long unsigned", "float32", "range"]
@@ -170,7 +172,7 @@ def test_what_changes_is_kept(model, before, after):
 )  # fmt: skip
 def test_what_will_not_come_back_is_named(model, before, after):
     _, _, named = there_and_back(model, (before, "None"), (after, "None"))
-    if (before, after) != ("views", "no views"):  # three arrays, each its own again
+    if (before, after) != ("views", "no views"):  # separate arrays can be made from their content
         assert len(named) >= 1
         assert all(why.startswith("callbacks.callbacks[0].x") for why in named)
 
@@ -179,7 +181,7 @@ def test_what_will_not_come_back_is_named(model, before, after):
 
 
 class Grows(BaseCallback):
-    """What it holds can be captured when training begins, and not from step 30 on."""
+    """A callback whose values can be captured when training begins, but no longer from step 30 on."""
 
     def __init__(self):
         super().__init__()
@@ -218,11 +220,11 @@ def test_what_cannot_be_captured_any_more_is_named_once_and_ends_nothing(tmp_pat
     ]
     grows = Grows()
     run(tmp_path, grows)
-    assert (grows.count, grows.notes, grows.lock) == (100, [], None)  # as built, but for what can be captured
+    assert (grows.count, grows.notes, grows.lock) == (100, [], None)  # the count is restored, the others are as built
 
 
 def test_a_usual_run_has_nothing_to_name_and_verifies_in_no_time(tmp_path):
-    """Its files are left alone: they are not restored when training begins."""
+    """Verifying does not restore the files of the run, only its objects."""
     model = SAC("MlpPolicy", "HalfCheetah-v5", seed=1, device="cpu", learning_starts=10, buffer_size=200_000)
     states = ResumeCallback(tmp_path, freq=20, verbose=0)
     with warnings.catch_warnings():
@@ -243,7 +245,7 @@ def test_verify_can_be_called_before_training(tmp_path):
 
 
 def test_verify_compares_without_the_code_that_restores(model, monkeypatch):
-    """A kind whose restoring is broken is noticed, whatever it is."""
+    """A kind whose ``restore`` is broken is noticed, whichever it is."""
     holds = Holds(bytearray(b"ab"), [1, 2])
     monkeypatch.setattr(KINDS["bytearray"], "restore", lambda context, content, existing, path: existing + b"c")
     names, _ = state.verify(model, CallbackList([holds]))
@@ -252,7 +254,7 @@ def test_verify_compares_without_the_code_that_restores(model, monkeypatch):
 
 
 class Draws(Still):
-    """An environment whose restore fails: its object is of another class in the second process."""
+    """An environment whose restore fails: its ``part`` is of another class in the second process."""
 
     kind = Node
 
@@ -274,7 +276,7 @@ def make_model_on(env):
 
 
 class Walks(Still):
-    """An environment whose state is a new array in the memory of another library after every step."""
+    """An environment whose state is a new array at every step, in memory that another library owns."""
 
     observation_space = gym.spaces.Box(-1e3, 1e3, (2,))
 
@@ -403,9 +405,10 @@ def test_what_lies_around_environments_that_cannot_be_captured_continues(tmp_pat
     (before, first_rows), (after, rows) = seen
     assert min(after) == 40
     assert after[40] == before[40]
-    assert rows[:4] == first_rows[:4]  # of the episodes that had ended
+    assert rows[:4] == first_rows[:4]  # of the two episodes of each environment that had ended
     assert len(rows) == after[98][2]
-    assert drawn[1][1:5] == drawn[0][21:25]  # after that of the first reset, which training begins with
+    # The first run drew for a reset and 20 steps until then; the second, for the reset with which learn() begins
+    assert drawn[1][1:5] == drawn[0][21:25]
 
 
 @pytest.mark.parametrize("is_outer", [True, False])
@@ -425,7 +428,7 @@ def test_a_wrapper_of_another_class_starts_episodes_again_and_ends_nothing(tmp_p
 
 
 class Informs(Reach):
-    """An environment with a value in its infos, besides others, from step 15 on."""
+    """An environment whose infos hold one more value, made from a recipe, after step 15."""
 
     def __init__(self, leaf):
         super().__init__()

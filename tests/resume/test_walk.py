@@ -1,4 +1,4 @@
-"""Objects to JSON and arrays and back, by what a user would see."""
+"""Objects captured as JSON and arrays, and restored, compared by what a user would see."""
 
 import collections
 import enum
@@ -128,7 +128,7 @@ def test_generators_go_on(make):
     expected = draw(generator)
     draw(other), draw(other)
     (restored,) = Restore(KINDS, context.arrays).restore(node, [other], "generators")
-    assert restored is other  # whoever holds it goes on too
+    assert restored is other  # whatever holds it continues with it
     assert draw(restored) == expected
     (made,) = Restore(KINDS, context.arrays).restore(node, [], "generators")
     assert draw(made) == expected
@@ -295,7 +295,7 @@ def test_what_does_not_fit_is_refused(before, there):
 
 
 def test_a_simulator_behind_a_number_is_not_taken_for_its_state(monkeypatch):
-    """As pybullet's client: a Python object whose state is elsewhere."""
+    """Like PyBullet's client: a Python object whose state is elsewhere."""
     monkeypatch.setattr(sys.modules[__name__], "p", types.ModuleType("pybullet"), raising=False)
     with pytest.raises(NotCapturedError, match="uses pybullet"):
         Capture(KINDS).capture(Point(0), "env")

@@ -1,4 +1,4 @@
-"""Files of others: what SB3 saves opens, bit for bit; what is poisoned, damaged or huge is refused, and never runs."""
+"""Untrusted files: what SB3 saves opens, bit for bit; what is poisoned, damaged or huge is refused, and never runs."""
 
 import base64
 import collections
@@ -72,7 +72,7 @@ def touch_marker():
 
 
 class Poison:
-    """Runs when it is unpickled: by a builtin that needs no import of this module, as an attacker's would."""
+    """An object that runs code when it is unpickled: by a builtin, without this module, as an attacker's would."""
 
     def __reduce__(self):
         return (exec, ("import os, pathlib; pathlib.Path(os.environ['MARKER']).touch()",))
@@ -143,7 +143,7 @@ def test_it_opens_what_sb3_saves_and_is_the_same_model(tmp_path, name, monkeypat
     def forbidden(*args, **kwargs):
         raise AssertionError("an unpickler was used")
 
-    with monkeypatch.context() as patch:  # torch's restricted one is its own
+    with monkeypatch.context() as patch:  # torch.load's restricted unpickler is a separate one
         for module, attribute in ((pickle, "load"), (pickle, "loads"), (cloudpickle, "loads")):
             patch.setattr(module, attribute, forbidden)
         opened = load_safely(path, given_env, device="cpu", algorithm=algorithm)
@@ -157,17 +157,17 @@ def test_it_opens_what_sb3_saves_and_is_the_same_model(tmp_path, name, monkeypat
             th.manual_seed(0)
             actions.append(of.predict(observation, deterministic=deterministic)[0])
         np.testing.assert_array_equal(*actions)
-    assert str(opened.get_parameters()) == str(reference.get_parameters())  # optimizers and all
+    assert str(opened.get_parameters()) == str(reference.get_parameters())  # with the optimizers
     left = {"start_time", "ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs", "action_noise"}
     left |= {"_last_episode_starts"}
     for key, value in vars(reference).items():
         if key not in left and " object at 0x" not in str(value):
             assert str(vars(opened)[key]) == str(value), key
-    assert str(opened.action_noise) in str(reference.action_noise)  # VectorizedActionNoise holds it
+    assert str(opened.action_noise) in str(reference.action_noise)  # the latter may be in a VectorizedActionNoise
 
-    opened.set_env(env)  # and it goes on learning
+    opened.set_env(env)  # the opened model continues to learn
     steps = opened.num_timesteps
-    opened.learning_starts = steps + 10  # HER samples after the end of an episode
+    opened.learning_starts = steps + 10  # HER can only sample after an episode has ended
     opened.learn(30, reset_num_timesteps=False)
     assert opened.num_timesteps > steps
 
@@ -275,7 +275,7 @@ def test_odd_values_give_one_sentence(saved, tmp_path, value):
     for name in fields_of(saved):
         path = with_fields(saved, tmp_path / "x.zip", **{name: value})
         opened += error_of(path) is None
-    assert opened < 25  # what is not looked at, and what may be so
+    assert opened < 25  # fields that are not read, and fields that may have the value
 
 
 @pytest.mark.parametrize(
@@ -307,7 +307,7 @@ def test_networks_of_very_many_layers_are_refused_before_they_are_built(tmp_path
     monkeypatch.setattr(budget, "MAX_SECONDS", 1.0)
     start = time.process_time()
     assert "policy_kwargs: it takes too long to read" in refuse(path)
-    assert time.process_time() - start < 5  # 1 s; all of the networks take 16 and 67
+    assert time.process_time() - start < 5  # it takes 1 s; building all of the networks takes 16 s and 67 s
 
 
 def test_dict_spaces_of_very_many_parts_are_refused(saved, tmp_path):
@@ -400,7 +400,8 @@ def test_tensors_that_say_more_than_their_bytes_are_refused(saved, tmp_path):
 
 
 def test_networks_may_not_be_far_larger_than_the_file(tmp_path):
-    assert "actor.optimizer.pth" in refuse(one_storage(tmp_path, None, width=256, depth=2))  # the networks are made
+    # These are small enough to be made; the state of the optimizer, of other networks, does not fit them
+    assert "actor.optimizer.pth" in refuse(one_storage(tmp_path, None, width=256, depth=2))
     path = one_storage(tmp_path, None, width=2048, depth=4)
     assert path.stat().st_size < 2**20
     assert "far more memory than it has bytes" in refuse(path)
@@ -482,7 +483,7 @@ def test_zip_bombs_are_refused_unread(saved, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(zipfile, "ZipFile", forbidden)
         assert "too many entries" in refuse(many)
-    lie = bytearray(saved.read_bytes())  # an entry that says it is of 4 GB
+    lie = bytearray(saved.read_bytes())  # an entry that claims to have 4 GB
     entry = lie.rindex(b"PK\1\2")
     struct.pack_into("<LL", lie, entry + 20, 2**32 - 2, 2**32 - 2)
     path.write_bytes(lie)
@@ -502,7 +503,7 @@ def test_no_more_of_an_entry_is_decompressed_than_it_says(saved, tmp_path):
 
 def test_reading_entries_takes_its_time_from_the_budget(saved):
     spent = Budget(saved.stat().st_size)
-    spent.take_bytes = lambda _: setattr(spent, "deadline", 0.0)  # after the first look at it
+    spent.take_bytes = lambda _: setattr(spent, "deadline", 0.0)  # the time is up once the entries are listed
     with open(saved, "rb") as file, pytest.raises(UnsafeFileError, match="takes too long"):
         read_archive(file, MODEL_ENTRIES, spent)
 
@@ -510,7 +511,7 @@ def test_reading_entries_takes_its_time_from_the_budget(saved):
 def test_entries_are_counted_once(saved, tmp_path):
     start = time.process_time()
     assert "policy.pth: it does not hold weights" in refuse(crowd(tmp_path, saved))
-    assert time.process_time() - start < 1.5  # 0.2 s; looking for each among all takes 4
+    assert time.process_time() - start < 1.5  # 0.2 s; counting each name among all entries takes 4 s
 
 
 def test_a_compressed_copy_opens(saved, tmp_path):
@@ -665,7 +666,7 @@ def test_a_replay_buffer_is_that_of_sb3(tmp_path, marker, name):
 
 
 class Weighted(BitFlippingEnv):
-    """Rewards depend on infos."""
+    """An environment whose rewards depend on its infos."""
 
     def step(self, action):
         *results, info = super().step(action)
@@ -726,7 +727,7 @@ def test_infos_of_tens_of_thousands_of_transitions_are_not_too_many(tmp_path):
 
 
 def test_observations_of_the_fused_update_load_into_a_fresh_model(tmp_path):
-    """They are float32 there, as its packed rows are, and float64 in a new buffer, as the environment has them."""
+    """The fused update keeps them as float32, like its packed rows; a new buffer, as float64, like the environment."""
     model = TDC("MlpPolicy", "Hopper-v4", fused=True, policy_kwargs={"net_arch": [8, 8]}, **TINY).learn(60)
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     fresh = TDC("MlpPolicy", "Hopper-v4", policy_kwargs={"net_arch": [8, 8]}, **TINY)
@@ -981,7 +982,7 @@ def test_statistics_buffers_and_folders_can_be_inspected(run, tmp_path, marker, 
 
 
 class ReplayBuffer:
-    """Of another module than SB3's, which SB3's own load would import."""
+    """A class named like SB3's, in another module, which SB3's own load would import."""
 
 
 def test_a_pickle_is_known_by_its_module_too(tmp_path, capsys):
@@ -1033,7 +1034,7 @@ def test_every_field_that_is_required_is_written_by_sb3_and_refused_without(tmp_
     declared = saved_fields(ALGORITHMS[name.split("-")[0]])
     required = sorted(field for field, how in declared.items() if how.is_required)
     assert {"gamma", "learning_rate", "_n_updates"} < set(required) <= set(fields)
-    left_out = required[sum(map(ord, name)) % 10]  # another one for each model
+    left_out = required[sum(map(ord, name)) % 10]  # chosen by the name of the model
     data = {field: value for field, value in fields.items() if field != left_out}
     error = refuse(rewrite(tmp_path / "model.zip", tmp_path / "x.zip", data=json.dumps(data)))
     assert f"the field {left_out} is missing" in error or left_out == "policy_class"

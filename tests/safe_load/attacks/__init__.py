@@ -1,8 +1,8 @@
 """
-Files that ask for more than data: for each kind a generator, ``make(folder, model)``, which writes one.
+Files that ask for more than data: for each kind, a function ``make(folder, model)`` writes one and returns its path.
 
 ``python -m tests.safe_load.attacks MODEL.zip [NAME ...]`` opens them one after the other in its process, and prints
-what each took; the tests run it in a child.
+the time and the memory that each took; the tests run it in a child process.
 """
 
 from tests.safe_load.attacks import buffers, data, folders, pickles, tensors, zips

@@ -1,4 +1,4 @@
-"""Open every attack in this process, and print what each took as JSON."""
+"""Open every attack in this process, and print the time and the memory that each took, as JSON."""
 
 import contextlib
 import io
@@ -38,13 +38,13 @@ def open_file(path: Path) -> str:
 
 
 def reset_peak() -> int:
-    """Let the kernel measure the peak of this process from here on. :return: what it takes now, in KiB"""
+    """Let the kernel measure the peak memory of this process from here on. :return: its present memory, in KiB"""
     Path("/proc/self/clear_refs").write_text("5")
     return peak()
 
 
 def peak() -> int:
-    """:return: the most memory that this process took since, in KiB"""
+    """:return: the peak memory of this process since the last reset, in KiB"""
     (size,) = re.findall(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
     return int(size)
 

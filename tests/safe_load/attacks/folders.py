@@ -1,4 +1,4 @@
-"""Folders of runs whose YAML is a bomb, a pipe or a device, lacks what is needed, or asks for what writes files."""
+"""Run folders whose YAML is a bomb, a pipe or a device, lacks required keys, or names wrappers that write files."""
 
 import os
 import shutil

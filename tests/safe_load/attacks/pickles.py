@@ -1,4 +1,4 @@
-"""Pickled fields that hang a reader, fill its memory, or drive the terminal that shows the refusal."""
+"""Pickled fields that hang a reader, fill its memory, or control the terminal that shows the refusal."""
 
 import base64
 import json
@@ -99,7 +99,7 @@ def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
 
 
 def images_of_many_names(n: int = 900) -> bytes:
-    """One image, for which a network is built as often as it is named."""
+    """One image under many names: a network is built for every name."""
     size = (1, 36, 36)
     box = with_state(_BOX, low=array(bytes(36**2), "u1", *size), high=array(b"\xff" * 36**2, "u1", *size))
     return Op.PROTO + box + Op.put(1) + Op.POP + dict_space(Op.get(1), n) + Op.STOP
@@ -112,7 +112,7 @@ def many_images(folder, model):
 
 
 def noise_of_doubled_lists() -> bytes:
-    """Twenty-six levels: an array of so many numbers could be made, slowly."""
+    """A mean of lists doubled only 26 times: NumPy could make an array of them, slowly."""
     lists = doubled(times=26)[: -len(Op.STOP)] + Op.POP * 27
     state = Op.EMPTY_DICT + Op.MARK + Op.text("_mu") + Op.get(26) + Op.text("_sigma") + Op.integer(1) + Op.SETITEMS
     noise = Op.name("stable_baselines3.common.noise", "NormalActionNoise") + Op.EMPTY_TUPLE + b"\x81"
@@ -120,14 +120,18 @@ def noise_of_doubled_lists() -> bytes:
 
 
 def of_bytes(field: str, name: bytes, *attributes: str, size: int = 40_000_000):
-    """An object of one array of one-byte numbers, of which it makes eight-byte ones, in a file of 1 MB."""
+    """
+    Return a ``make`` for an object that holds one array of one-byte numbers and converts it to eight-byte ones.
+
+    The file has 1 MB.
+    """
 
     def make(folder, model):
         numbers = array(b"\1" * size, "u1", size) + Op.put(1) + Op.POP
         raw = Op.PROTO + numbers + with_state(name, **dict.fromkeys(attributes, Op.get(1))) + Op.STOP
         noise = base64.b64encode(
             os.urandom(size // 60)
-        ).decode()  # all ones would be compressed more than a hundredfold
+        ).decode()  # without it, the ones would be compressed more than a hundredfold, and refused
         data = {**fields_of(model), field: pickled(raw), "tensorboard_log": noise}
         return rewrite(model, folder / "x.zip", deflate=True, data=json.dumps(data))
 

@@ -1,4 +1,4 @@
-"""Files of tensors whose pickle says something else than their bytes."""
+"""Files of tensors whose pickle contradicts their bytes, and weights and optimizer states that cannot be used."""
 
 import io
 import zipfile
@@ -11,13 +11,13 @@ from tests.safe_load.attacks.tools import Op, pth, rewrite, tensor, with_fields
 
 
 def _policy(tree: bytes, **records: bytes):
-    """In the place of all weights."""
+    """Return a ``make`` that replaces all weights with the tensors of a pickle, ``tree``, over ``records``."""
     named = Op.PROTO + Op.EMPTY_DICT + Op.text("w") + tree + Op.SETITEM + Op.STOP
     return lambda folder, model: rewrite(model, folder / "x.zip", **{"policy.pth": pth(named, **records)})
 
 
 def changed(name, change):
-    """The state of an optimizer, or the like, changed."""
+    """Return a ``make`` that changes the content of one file of tensors, such as the state of an optimizer."""
 
     def make(folder, model):
         with zipfile.ZipFile(model) as archive:

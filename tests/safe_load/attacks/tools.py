@@ -1,4 +1,4 @@
-"""How files are put together."""
+"""Functions that put zips, fields, pickles and files of tensors together."""
 
 import base64
 import io
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def rewrite(model: Path, target: Path, deflate: bool = False, **entries: bytes | str | None) -> Path:
-    """A copy of a zip with some of its entries replaced or added; None: left out."""
+    """Write a copy of a zip with some of its entries replaced or added; an entry that is None is left out."""
     compression = zipfile.ZIP_DEFLATED if deflate else zipfile.ZIP_STORED
     with zipfile.ZipFile(model) as old, zipfile.ZipFile(target, "w", compression) as new:
         for name, content in {**{name: old.read(name) for name in old.namelist()}, **entries}.items():
@@ -25,7 +25,7 @@ def fields_of(model: Path) -> dict[str, Any]:
 
 
 def with_fields(model: Path, target: Path, **fields: Any) -> Path:
-    """A copy with some fields of ``data`` replaced; ``...``: left out."""
+    """Write a copy with some fields of ``data`` replaced; a field that is ``...`` is left out."""
     data = {**fields_of(model), **fields}
     return rewrite(model, target, data=json.dumps({name: v for name, v in data.items() if v is not ...}))
 
@@ -36,7 +36,7 @@ def pickled(raw: bytes) -> dict[str, str]:
 
 
 def pth(tree: bytes, **records: bytes) -> bytes:
-    """A file of tensors with this pickle and these records (``data_0``: of the storage 0)."""
+    """A file of tensors with this pickle and these records (``data_0`` is that of storage 0)."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("archive/data.pkl", tree)

@@ -1,4 +1,4 @@
-"""Zips that grow."""
+"""Zips that inflate to many times their size."""
 
 import io
 import struct
