@@ -1,4 +1,4 @@
-"""YAML files: Table 1 as printed, the default under every entry, and what is said of mistakes."""
+"""YAML files: Table 1 as printed, the default under every entry, and the messages about mistakes."""
 
 import re
 
@@ -62,7 +62,7 @@ def test_every_file_is_valid_in_every_entry(algo):
             continue
         if h.n_envs == 1:
             assert h.model["policy_kwargs"]["net_arch"] == [256, 256]
-        if env_id in TABLE_1:  # all algorithms run as long, and warm up as long
+        if env_id in TABLE_1:  # all algorithms have the same steps and warm-up
             assert (h.n_timesteps, h.model["learning_starts"]) == TABLE_1[env_id][:2]
 
 
@@ -218,7 +218,7 @@ def test_mistakes_are_named(entry, message):
 @pytest.mark.parametrize("algo", ALGORITHMS)
 @pytest.mark.parametrize("entry", [{"batch_size": 0}, {"gamma": 1.01}, {"buffer_size": -5}, {"learning_starts": -1}])
 def test_numbers_are_checked_for_every_algorithm(algo, entry):
-    """SB3's own constructors take any."""
+    """SB3's own constructors accept any number."""
     with pytest.raises(ValueError, match=f"file.yml, Env-v0: {next(iter(entry))} must be "):
         parse_tdc(entry, ALGORITHMS[algo])
 

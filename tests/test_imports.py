@@ -1,4 +1,4 @@
-"""The house: imports point in one direction (a contract in pyproject.toml), without circles; a few cost nothing."""
+"""Imports: in one direction (a contract in pyproject.toml), without circles, without packages that are not needed."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ def test_no_modules_import_each_other_in_a_circle():
     while leaves := [module for module, imported in remaining.items() if not imported & remaining.keys()]:
         for module in leaves:
             del remaining[module]
-    assert remaining == {}  # what is left imports, directly or not, itself
+    assert remaining == {}  # whatever remains imports itself, directly or not
 
 
 def test_the_package_is_imported_without_simulators_plots_and_searches():

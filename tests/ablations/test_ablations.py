@@ -1,4 +1,4 @@
-"""Variants of TDC against float64 transcriptions of what they say."""
+"""Variants of TDC against float64 transcriptions of their definitions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""λ that calibrates itself: the direction, the units, what counts, and that it survives stopping."""
+"""Self-calibrating λ: its direction, its units, which errors count, and how it is saved and continued."""
 
 import math
 import re
@@ -37,7 +37,7 @@ def short_period(monkeypatch):
 
 
 def make_fast(env=None, **kwargs):
-    """Whose calibration begins after two updates."""
+    """Make a model whose calibration begins after two updates, unless ``tau`` or ``gamma`` is given."""
     return make(env or TwoActions(), algorithm=CalibratedTDC, **{"tau": 1.0, "gamma": 0.5, **kwargs})
 
 
@@ -45,14 +45,14 @@ def make_fast(env=None, **kwargs):
 
 
 def test_one_step_by_hand():
-    # The first errors set the scale, |4| and |−2| on average: 3; λ moves by 0.1 · 1/3
+    # The first errors set the scale to their mean size, (|4| + |−2|)/2 = 3; λ rises by 0.1 · 1/3
     lam, scale = calibrate(1.0, 0.0, np.array([4.0, -2.0]), 0.0)
     assert (lam, scale) == (pytest.approx(1 + 0.1 / 3), 3)
-    # Then the scale moves by a twentieth of the way from 3 to 1, to 2.9; λ falls by 0.1/2.9
+    # Then the scale moves a twentieth of the way from 3 to 1, to 2.9; λ falls by 0.1/2.9
     lam, scale = calibrate(lam, scale, np.array([-1.0]), 0.0)
     assert scale == pytest.approx(2.9)
     assert lam == pytest.approx(1 + 0.1 / 3 - 0.1 / 2.9)
-    # An error of many times the scale moves λ no further than by 0.1
+    # An error of many times the scale moves λ by no more than 0.1
     assert calibrate(1.0, 0.01, np.array([50.0]), 0.0)[0] == pytest.approx(1.1)
 
 
@@ -110,7 +110,7 @@ def test_it_waits_until_values_can_have_their_size():
     assert updates_before(tau=0.0, gamma=0.9) == math.inf
 
 
-# ---------------------------------------------------------------- what counts
+# ---------------------------------------------------------------- which errors count
 
 
 def test_returns_of_an_episode_by_hand():
@@ -133,7 +133,7 @@ def test_it_waits_for_steps_and_for_updates():
     pending.end_episode(1, np.array([3.0]))
     assert pending.take_errors(1_099) is None
     assert pending.take_errors(1_100).tolist() == [1, 2, 3]
-    assert pending.take_errors(5_000) is None  # they count once
+    assert pending.take_errors(5_000) is None  # each error counts once
     assert pending.episodes[0].rewards == []
     pending.end_episode(0, None)
     assert pending.errors == []
@@ -153,7 +153,11 @@ GAMMA, HAZARD, LIMIT = 0.95, 0.01, 150
 
 
 def play(rng):
-    """Reward 1 at every step, and an end by itself with the same probability after each: rewards, whether it ended."""
+    """
+    Play an episode with reward 1 at every step, which terminates with the same probability after each.
+
+    :return: the rewards, and whether the episode terminated
+    """
     length = rng.geometric(HAZARD)
     return np.ones(min(length, LIMIT)), length <= LIMIT
 
@@ -174,7 +178,7 @@ def test_an_exact_critic_is_left_alone_though_time_limits_end_the_good_episodes(
 
 
 class Recorded(TwoActions):
-    """Writes down what a slow reference needs: observations, actions, rewards, and how each episode ended."""
+    """Records what the slow reference needs: observations, actions, rewards, and how each episode ended."""
 
     def reset(self, **kwargs):
         observation, info = super().reset(**kwargs)
@@ -191,7 +195,7 @@ class Recorded(TwoActions):
 
 
 def reference_errors(model, normalization, trajectory, terminated):
-    """G − Q₁ in float64, step by step."""
+    """Return G − Q₁ in float64, computed step by step."""
     observations = [normalization.normalize_obs(o[None]) for o in trajectory["observations"]]
     scaled = [model.policy.scale_action(action) for action in trajectory["actions"]]
     scaled.append(model.policy.scale_action(model.predict(observations[-1], deterministic=True)[0][0]))
@@ -213,14 +217,14 @@ def reference_errors(model, normalization, trajectory, terminated):
 @HEADS
 @pytest.mark.parametrize("timeouts_count", [True, False])
 def test_errors_are_those_of_a_slow_reference(monkeypatch, short_period, stochastic_actor, timeouts_count):
-    """Two environments, episodes that end in both ways, normalised observations and rewards; nothing is learned."""
+    """Two environments, terminated and truncated episodes, normalised observations and rewards; nothing is learned."""
     monkeypatch.setattr(calibration, "EVERY", 2)
     logs = [[], []]
 
     def make_env(i):
         env = Recorded()
         env.log = logs[i]
-        env.episode = i - 1  # so that one environment's first episode is cut off and the other's ends by itself
+        env.episode = i - 1  # one environment's first episode is truncated, the other's terminates
         return env
 
     numbers = iter((0, 1))
@@ -247,14 +251,14 @@ def test_errors_are_those_of_a_slow_reference(monkeypatch, short_period, stochas
                 expected = reference_errors(model, vector, trajectory, terminated or not timeouts_count)
                 np.testing.assert_allclose(errors, expected, rtol=1e-4, atol=1e-5)
     assert {length for _, length, errors in ended if errors is not None} == {5, 7}
-    assert sum(errors is None for *_, errors in ended) >= 8  # the warm-up, and then ten updates
+    assert sum(errors is None for *_, errors in ended) >= 8  # during the warm-up and the first ten updates
 
 
 # ---------------------------------------------------------------- in training
 
 
 class Pays(TwoActions):
-    """A reward that critics cannot have predicted in the beginning: λ has to go up, or down."""
+    """Pays a reward that the critics cannot predict at first: λ has to rise or fall."""
 
     reward = 0.0
 
@@ -276,7 +280,7 @@ def test_it_follows_the_sign_of_the_error(short_period, reward, rises):
 def test_it_works_where_time_limits_are_short(monkeypatch):
     monkeypatch.setattr(calibration, "PERIOD", 200)
     model = make(algorithm=CalibratedTDC, tau=1.0, gamma=0.9, qf_learning_rate=0.0).learn(700)  # Pendulum: 200 steps
-    assert model.scheduled("lam") < 1  # values of 0, and costs
+    assert model.scheduled("lam") < 1  # the critics stay near 0, but all rewards are negative
 
 
 @HEADS
@@ -292,7 +296,7 @@ def test_both_paths_calibrate_alike(short_period, stochastic_actor, n_envs):
 
 
 def test_errors_are_in_the_critics_units(short_period):
-    """With normalised rewards of 1000 times the size, λ is the same."""
+    """Rewards 1000 times as large lead to the same λ once they are normalised."""
     lams = []
     for factor in (1.0, 1000.0):
         env = VecNormalize(
@@ -313,7 +317,7 @@ def test_actions_without_axes(short_period):
     assert make_fast(Scalar()).learn(200).scheduled("lam") != 1
 
 
-# ---------------------------------------------------------------- stopping and going on
+# ---------------------------------------------------------------- saving and continuing
 
 
 def test_it_is_saved_and_continues(tmp_path, short_period):
@@ -381,7 +385,7 @@ def test_a_step_that_a_callback_loses_is_not_joined_with_what_follows(monkeypatc
 
 def test_episodes_that_start_again_are_new(monkeypatch):
     lengths = lengths_of_episodes(monkeypatch)
-    model = make_fast().learn(53)  # 4 × (5 + 7) steps, and 5 of the next
+    model = make_fast().learn(53)  # 4 × (5 + 7) steps, then an episode of 5
     model.learn(3, reset_num_timesteps=False)
     restart_episodes(model)
     assert [episode.rewards for episode in model._calibration.episodes.values()] == [[]]
@@ -400,7 +404,7 @@ def test_without_a_reset_the_next_episodes_are_followed_too(tmp_path, short_peri
 
 
 def test_calibrating_changes_nothing_else(short_period):
-    """λ is put back after every calibration: the same weights as with this λ."""
+    """With λ reset after every calibration, the weights equal those of plain TDC with this λ."""
 
     def calibrate_and_put_back(errors):
         CalibratedTDC._calibrate(held, errors)

@@ -1,4 +1,4 @@
-"""Who sits on a board, what it does, and that it comes back with a model."""
+"""The advisory board: its members, its actions, and that it is saved and loaded with its model."""
 
 import inspect
 
@@ -33,7 +33,11 @@ def perturb(network, seed):
 
 
 def fill(model, returns):
-    """Propose a new actor for every return; the weights that each had, by return."""
+    """
+    Propose a new actor for every return.
+
+    :return: the weights of each actor, by its return
+    """
     actors = {}
     for seed, test_return in enumerate(returns):
         perturb(model.policy.actor, seed)
@@ -52,10 +56,10 @@ def observations(n=50):
     [
         ([5.0], [5.0]),
         ([1.0, 2.0], [2.0, 1.0]),
-        ([2.0, 1.0, 3.0, -4.0], [3.0, 2.0, 1.0]),  # −4 finds no seat
-        ([1.0, 2.0, 3.0, 2.5], [3.0, 2.5, 2.0]),  # 1 leaves
+        ([2.0, 1.0, 3.0, -4.0], [3.0, 2.0, 1.0]),  # −4 gets no seat
+        ([1.0, 2.0, 3.0, 2.5], [3.0, 2.5, 2.0]),  # 1 loses its seat
         ([1.0, 2.0, 3.0, 9.0, 8.0], [9.0, 8.0, 3.0]),
-        ([np.nan, 1.0, np.inf, 2.0, -np.inf], [2.0, 1.0]),  # nothing would ever be above NaN
+        ([np.nan, 1.0, np.inf, 2.0, -np.inf], [2.0, 1.0]),  # no return would ever rank above NaN
     ],
 )
 def test_members_are_ordered_by_their_returns(algorithm, returns, expected):
@@ -94,7 +98,7 @@ def test_the_cooperative_action_is_the_best_by_brute_force(algorithm):
             values = [brute_force_score(model, obs[i : i + 1], action) for action in advice]
             members.add(int(np.argmax(values)))
             assert th.allclose(chosen[i], advice[int(np.argmax(values))][0], atol=1e-6)
-    assert len(members) > 1  # not always the same
+    assert len(members) > 1  # not always the same member
 
 
 @ALGORITHMS
@@ -130,7 +134,7 @@ def test_the_actor_can_act_without_its_board(algorithm):
 @ALGORITHMS
 def test_without_members_the_actor_acts(algorithm):
     model = make(algorithm)
-    plain = algorithm.__bases__[1]  # SB3's
+    plain = algorithm.__bases__[1]  # SB3's class
     expected = plain.policy_aliases["MlpPolicy"]._predict(model.policy, th.tensor(observations()), deterministic=True)
     with th.no_grad():
         assert np.allclose(model.policy._predict(th.tensor(observations()), deterministic=True), expected.detach())
@@ -155,7 +159,7 @@ def test_critics_and_members_are_in_evaluation_mode_when_the_board_acts(monkeypa
 
 
 class Watch(BaseCallback):
-    """Counts the episodes of a training, and notes for every episode whether the board was asked for an action."""
+    """Records for every training episode whether the board was asked for an action."""
 
     def __init__(self, monkeypatch):
         super().__init__()
@@ -207,17 +211,17 @@ def test_test_episodes_use_the_statistics_of_the_training():
     eval_env = VecNormalize(make_vec_env(TwoActions, 1, seed=2), training=False, norm_reward=False)
     model = make(env=env)
     model.learn(40, callback=BoardCallback(eval_env))
-    assert eval_env.obs_rms.count > 20  # its own stays at 10⁻⁴
+    assert eval_env.obs_rms.count > 20  # its own count stays at 10⁻⁴: it does not train
     with pytest.raises(ValueError, match="one environment, got 2"):
         BoardCallback(make_vec_env(TwoActions, 2))
 
 
 @ALGORITHMS
 def test_test_episodes_may_be_monitored_outside_the_normalisation(algorithm):
-    """Returns are then numbers of NumPy, and the statistics lie deeper."""
+    """Returns are then NumPy scalars, and the statistics are one wrapper further inside."""
     env, eval_env = (VecMonitor(VecNormalize(make_vec_env(TwoActions, 1, seed=seed))) for seed in (1, 2))
     make(algorithm, env=env).learn(40, callback=BoardCallback(eval_env))
-    assert env.obs_rms.count - 7 <= eval_env.obs_rms.count <= env.obs_rms.count  # since the last episode has ended
+    assert env.obs_rms.count - 7 <= eval_env.obs_rms.count <= env.obs_rms.count  # copied when the last episode ended
 
 
 def test_returns_of_test_episodes_are_not_normalised():
@@ -226,12 +230,12 @@ def test_returns_of_test_episodes_are_not_normalised():
             observation, _, *rest = super().step(action)
             return observation, -1.0, *rest
 
-    env, eval_env = (VecNormalize(DummyVecEnv([Constant])) for _ in range(2))  # no Monitor, which would know them
+    env, eval_env = (VecNormalize(DummyVecEnv([Constant])) for _ in range(2))  # no Monitor with raw returns
     model = make(env=env, n_members=20)
     model.learn(40, callback=BoardCallback(eval_env))
     returns = model.policy.board.returns[: len(model.policy.board)].tolist()
-    assert set(returns) == {-5.0}  # every second episode has 5 steps, and every test resets twice
-    assert eval_env.obs_rms.count == pytest.approx(env.obs_rms.count, abs=10)  # its own steps are not in it
+    assert set(returns) == {-5.0}  # every second episode has 5 steps, and every test episode resets twice
+    assert eval_env.obs_rms.count == pytest.approx(env.obs_rms.count, abs=10)  # the steps of test episodes do not count
 
 
 @pytest.mark.parametrize("normalised", ["env", "eval_env"])
@@ -259,9 +263,9 @@ def test_a_board_is_saved_and_opened_with_its_model(tmp_path, algorithm):
 
 @ALGORITHMS
 def test_training_is_that_of_sb3_until_the_board_acts(algorithm):
-    """The same weights as SB3's algorithm that begins with them, with a board that is filled beside it."""
+    """The weights equal those of SB3's algorithm from the same initial ones, although a board is filled meanwhile."""
     settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 300, "seed": 0, "device": "cpu"}
-    settings |= {"fused": False} if algorithm is AdvBTDC else {}  # the update of a custom policy class
+    settings |= {"fused": False} if algorithm is AdvBTDC else {}  # as with any custom policy class
     plain = algorithm.__bases__[1]("MlpPolicy", TwoActions(), policy_kwargs={"net_arch": [8, 8]}, **settings)
     advised = make(algorithm, **settings)
     names = [name for name in advised.policy.state_dict() if not name.startswith(("board.", "lam"))]

@@ -40,7 +40,7 @@ def tags(folder):
     [(16, -1, None, 2), (1, -1, None, 1), (16, 5, None, 5), (16, -1, "7", 16), (16, 3, "7", 3)],
 )
 def test_threads(monkeypatch, available, asked, variable, expected):
-    """Two by default; what the user says, on the command line or in the environment, counts."""
+    """Two threads by default; the user's choice, on the command line or in the environment, takes precedence."""
     threads = [available]
     monkeypatch.setattr(th, "get_num_threads", lambda: threads[-1])
     monkeypatch.setattr(th, "set_num_threads", threads.append)
@@ -102,7 +102,7 @@ def test_the_baselines_run_through_the_same_pipeline(tmp_path, algo, capsys):
 def test_an_environment_without_an_entry_gets_the_default(tmp_path, capsys):
     assert run_train(tmp_path, "-tb", "", env="Pendulum-v1") == 0
     assert "tdc.yml, default (it has no entry for Pendulum-v1)" in capsys.readouterr().out
-    assert not list((tmp_path / "tdc" / "Pendulum-v1_1").glob("events*"))  # -tb "": off
+    assert not list((tmp_path / "tdc" / "Pendulum-v1_1").glob("events*"))  # -tb "" turns TensorBoard off
 
 
 def test_an_environment_in_another_version_gets_the_entry_of_the_nearest(tmp_path, capsys):
@@ -122,10 +122,10 @@ def test_stochastic_head_several_environments_and_normalisation(tmp_path, capsys
     capsys.readouterr()
     assert run_enjoy(folder) == 0
     returns = capsys.readouterr().out
-    assert run_enjoy(folder / "Hopper-v4.zip") == 0  # what lies beside a zip counts
+    assert run_enjoy(folder / "Hopper-v4.zip") == 0  # the statistics next to a zip are used
     assert capsys.readouterr().out == returns
     assert run_enjoy(folder, "--load-best") == 0
-    # The agent sees normalised observations, but the returns are the environment's: a Hopper lives on 1 a step
+    # The agent sees normalised observations, but the returns are the environment's: a Hopper gets 1 for each step
     episodes = [line.split() for line in returns.splitlines() if line.startswith("Episode")]
     assert all(float(words[3].rstrip(",")) > 0.5 * float(words[4]) for words in episodes)
 
@@ -144,7 +144,7 @@ def test_going_on_from_a_saved_model(tmp_path, capsys):
         assert run_train(tmp_path, "-i", first / name, n=120, small=normalized) == 0
         after = TDC.load(tmp_path / "tdc" / f"Hopper-v4_{i}" / "Hopper-v4.zip")
         assert after._n_updates == updates + 120  # the replay buffer was there: no warm-up again
-    assert run_train(tmp_path, "-i", first / "best_model.zip", n=120, small=normalized) == 0  # has none: warm-up again
+    assert run_train(tmp_path, "-i", first / "best_model.zip", n=120, small=normalized) == 0  # no buffer: warm-up again
     best, after = (TDC.load(p) for p in (first / "best_model.zip", tmp_path / "tdc" / "Hopper-v4_4" / "Hopper-v4.zip"))
     assert after._n_updates == best._n_updates + 20
 
@@ -174,7 +174,7 @@ def test_normalisation_goes_on_in_an_environment_of_another_id(tmp_path, capsys)
     assert run_train(tmp_path, "-i", first, env="Other-v0", n=130, small=normalized) == 0
     env = DummyVecEnv([lambda: gym.make("Other-v0")])
     saved = load_normalization(tmp_path / "tdc" / "Other-v0_1" / "Other-v0" / "vecnormalize.pkl", env)
-    assert round(saved.obs_rms.count) == (1 + 120) + (1 + 130)  # the first observation, and one each step
+    assert round(saved.obs_rms.count) == (1 + 120) + (1 + 130)  # the first observation, and one per step
 
 
 @pytest.mark.parametrize("small", [SMALL, [*SMALL, "normalize:true"]])
@@ -225,7 +225,7 @@ def test_an_environment_named_with_its_package(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(tmp_path)
     assert run_train(tmp_path, env="my_package:Mine-v0") == 0
     (command,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("To watch it")]
-    assert run_enjoy(*shlex.split(command)[5:]) == 0  # names the package: a folder alone imports nothing
+    assert run_enjoy(*shlex.split(command)[5:]) == 0  # names the package: a run folder alone imports nothing
 
 
 @pytest.fixture
@@ -274,7 +274,7 @@ def test_a_log_of_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     ("learning_starts", "train_freq", "n_updates"),
-    [(120, 1, 0), (119, 1, 1), (120, 50, 1), (150, 50, 0), (10, "[1, episode]", 1)],  # 120 steps end after 150
+    [(120, 1, 0), (119, 1, 1), (120, 50, 1), (150, 50, 0), (10, "[1, episode]", 1)],  # 120 steps end at 150
 )
 def test_a_run_that_learns_nothing_says_so(tmp_path, learning_starts, train_freq, n_updates, capsys):
     small = [*SMALL, f"learning_starts:{learning_starts}", f"train_freq:{train_freq}", "gradient_steps:1"]
@@ -380,7 +380,7 @@ def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
 
 
 def test_stopping_an_evaluation_that_would_never_end(tmp_path):
-    """Pendulum without its time limit, evaluated at step 150; who makes 200 steps is the evaluation's."""
+    """Pendulum without its time limit, evaluated at step 150: only the evaluation's environment reaches 200 steps."""
     code = f"""
 import gymnasium as gym, pathlib
 from gymnasium.envs.classic_control import PendulumEnv
@@ -615,7 +615,7 @@ def test_a_log_folder_that_is_a_file(tmp_path, capsys):
 
 def test_two_runs_never_share_a_tensorboard_folder(tmp_path):
     board = tmp_path / "my [board]"
-    (board / "Hopper-v4" / "TDC_1").mkdir(parents=True)  # of a run that has started at the same moment
+    (board / "Hopper-v4" / "TDC_1").mkdir(parents=True)  # as if by a run that started at the same moment
     for number in (2, 3):
         assert run_train(tmp_path, "-tb", board, n=120) == 0
         assert len(list((board / "Hopper-v4" / f"TDC_{number}").iterdir())) == 1

@@ -1,4 +1,4 @@
-"""How commands end that cannot come to their end: with a status and at most a sentence, never with a traceback."""
+"""Commands that cannot finish: they end with an exit status and at most one sentence, never with a traceback."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Which model ``enjoy`` takes, and what it does not take silently."""
+"""Which model ``enjoy`` plays, and which arguments it refuses."""
 
 import re
 import shutil
@@ -26,7 +26,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture
 def lone(run, tmp_path):
-    """A model that was taken out of its run."""
+    """A model that was copied out of its run folder."""
     return shutil.copy(run / "Pendulum-v1.zip", tmp_path / "lone.zip")
 
 
@@ -63,7 +63,7 @@ def test_a_file_of_a_run_is_chosen_once(run, capsys):
     model = run / "Pendulum-v1.zip"
     assert f"--load-best chooses a model, and so does {model}" in refused(capsys, model, "--load-best")
     assert "--env Hopper-v4 contradicts" in refused(capsys, model, "--env", "Hopper-v4")
-    assert run_enjoy(model, "--algo", "tdc", "--env", "Pendulum-v1") == 0  # it says the same
+    assert run_enjoy(model, "--algo", "tdc", "--env", "Pendulum-v1") == 0  # the flags agree with the run
 
 
 def test_a_file_outside_a_run_says_nothing_of_its_environment(lone, capsys):

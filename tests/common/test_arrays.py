@@ -1,4 +1,4 @@
-"""Arrays of files that are whole, damaged, or something else."""
+"""Arrays read from files that are intact, damaged, or unreadable."""
 
 import io
 

@@ -36,7 +36,7 @@ def test_observations_that_are_one_number_are_refused(algo, policy, space, place
 
     env = DummyVecEnv([lambda: Observing(space)])
     sentence = rf"at least one axis, got Box\(-1\.0, 1\.0, \(\), float32\){place}: give it the shape \(1,\)$"
-    if algo not in ("td3", "sac", "ddpg"):  # those are SB3's
+    if algo not in ("td3", "sac", "ddpg"):  # SB3's own classes check nothing
         with pytest.raises(ValueError, match=sentence):
             ALGORITHMS[algo](policy, env, replay_buffer_class=build_buffer)
     with pytest.raises(ValueError, match=sentence):

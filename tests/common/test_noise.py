@@ -1,4 +1,4 @@
-"""Noise of many environments is what SB3 draws for one after the other."""
+"""Noise drawn for many environments at once equals what SB3 draws for one after the other."""
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +20,7 @@ def test_one_draw_is_the_draws_of_sb3(n_envs, n_actions, seed, before):
     drawn = []
     for noise in (VectorizedActionNoise(one, n_envs), VectorizedNormalNoise(one, n_envs)):
         np.random.seed(seed)
-        np.random.normal(size=before)  # NumPy keeps every second number for the next call
+        np.random.normal(size=before)  # NumPy keeps every second normal number for the next call
         drawn.append([noise(), noise(), np.random.normal()])
     for expected, found in zip(*drawn, strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -34,7 +34,7 @@ def test_a_range_is_evenly_spaced_over_the_environments():
     drawn = np.stack([noise() for _ in range(20_000)])
     np.testing.assert_allclose(drawn.std(axis=0)[:, 0], [0.1, 0.2, 0.3, 0.4], rtol=0.03)
     alone = noise_of_all(noise.base_noise, 1)
-    assert np.stack([alone() for _ in range(20_000)]).std() == pytest.approx(0.25, rel=0.03)  # the middle
+    assert np.stack([alone() for _ in range(20_000)]).std() == pytest.approx(0.25, rel=0.03)  # the middle of the range
 
 
 @pytest.mark.parametrize(("mean", "sigma"), [(np.zeros(2), 0.1), (0.0, np.full(2, 0.1))])
@@ -52,7 +52,7 @@ def test_the_noise_of_one_environment_can_be_changed():
     ]
     for noise in noises:
         noise.noises[1]._mu = np.full(2, 5.0)
-        noise.noises[2]._sigma *= 0.5  # as where noise decays
+        noise.noises[2]._sigma *= 0.5  # as a decaying noise does
         assert noise.noises[2]._sigma.tolist() == [0.5, 0.5]
     drawn = []
     for noise in noises:
@@ -75,7 +75,7 @@ class Scalar(TwoActions):
 @pytest.mark.parametrize("algorithm", [TDC, MEOW, AdvBTD3, AdvBSAC, AdvBTDC])
 @pytest.mark.parametrize("noise", [0.1, NormalActionNoise(np.zeros(()), np.full((), 0.1))])
 def test_noise_of_actions_without_axes(algorithm, n_envs, noise):
-    env = make_vec_env(Scalar, n_envs)  # which checks every action
+    env = make_vec_env(Scalar, n_envs)  # checks every action
     settings = {"learning_starts": 8, "batch_size": 8, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
     model = algorithm("MlpPolicy", env, action_noise=noise, **settings).learn(24)
     assert model.replay_buffer.actions.shape[1:] == (n_envs, 1)

@@ -1,4 +1,4 @@
-"""Output that cannot be written never ends a run, and loses nothing of it."""
+"""Output that cannot be written: it never ends a run, and the run loses nothing else."""
 
 import io
 import os
@@ -42,7 +42,7 @@ class Broken(io.StringIO):
 
 def start(folder, steps, environment=None, **streams):
     command = [sys.executable, "-W", "ignore", str(ROOT / "train.py"), *OPTIONS, "-n", str(steps), "-f", str(folder)]
-    # The suite itself may run below nohup
+    # The suite itself may run under nohup, and a child would inherit that SIGHUP is ignored
     streams = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL), **streams}
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})}, **streams)
 

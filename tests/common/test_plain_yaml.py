@@ -1,4 +1,4 @@
-"""One reader for all that users write: numbers as in YAML 1.2, RL Zoo's Python notation, nothing evaluated."""
+"""One reader for everything that users write: numbers as in YAML 1.2, RL Zoo's Python notation, nothing evaluated."""
 
 import importlib.util
 import math
@@ -46,15 +46,15 @@ nested = st.recursive(plain | number_like, lambda inner: st.lists(inner) | st.di
 @given(nested)
 def test_what_is_written_is_read(value):
     assert plain_yaml.load(plain_yaml.dump(value), "") == value
-    assert yaml.safe_load(plain_yaml.dump(value)) == value  # by the readers of RL Zoo too
+    assert yaml.safe_load(plain_yaml.dump(value)) == value  # RL Zoo's reader finds the same
 
 
 def test_a_key_that_is_given_twice_is_refused_with_its_line():
     with pytest.raises(ValueError, match=r"my.yml is not YAML of plain values: line 3 gives lam a second time"):
         plain_yaml.load("A-v0:\n  lam: 1\n  lam: 2", "my.yml")
-    with pytest.raises(ValueError, match=r"gives \\x1b\[31m a second time"):  # and no terminal is driven by it
+    with pytest.raises(ValueError, match=r"gives \\x1b\[31m a second time"):  # the terminal never sees the escape
         plain_yaml.load('"\\e[31m": 1\n"\\e[31m": 2', "my.yml")
-    # What is merged is overruled, not given twice, also where a mapping that merges is merged
+    # A key may override a merged one, even where the merged mapping itself merges another: it is not given twice
     text = "a: &a {x: 1, y: 1}\nb: &b {<<: *a, x: 2}\nc: {<<: *b, x: 3, 1: 4, '1': 5}"
     assert plain_yaml.load(text, "")["c"] == {"x": 3, "y": 1, 1: 4, "1": 5}
 
@@ -136,7 +136,7 @@ def test_hyperparameters_in_notation():
         parse({"n_timesteps": 1, "normalize": "dict(norm_obs=open('x'))"}, SAC, "file.yml")
 
 
-# The modules that these wrappers are in have been removed, or are no dependency of RL Zoo
+# Entries whose wrappers are in modules that have been removed, or that RL Zoo does not depend on
 _ELSEWHERE = {("sac", "CarRacing-v3"), ("sac", "donkey-generated-track-v0")}
 
 

@@ -1,4 +1,4 @@
-"""What critics predict against what follows: by hand, then on a task whose returns are known."""
+"""The critics' predictions against the returns that follow: by hand, then on a task whose returns are known."""
 
 import csv
 
@@ -25,7 +25,7 @@ REWARDS = st.lists(st.floats(-100, 100), min_size=1, max_size=30)
 
 
 class Corridor(gym.Env):
-    """The reward is 1 at every step, whatever is done; it ends by itself after ``length`` steps."""
+    """A task with reward 1 at every step, whatever the action; it terminates after ``length`` steps."""
 
     observation_space = gym.spaces.Box(0, 1, (1,), dtype=np.float32)
     action_space = gym.spaces.Box(-2, 2, (1,), dtype=np.float32)
@@ -64,7 +64,7 @@ def test_discounted_returns_are_the_sums(rewards, gamma):
 
 
 def test_a_truncated_episode_is_known_where_its_tail_weighs_nothing():
-    # 0.5^7 = 0.0078 is the first power of at most 0.01: the last 6 of 10 steps have an unseen tail that weighs more
+    # 0.5^7 = 0.0078 is the first power of at most 0.01: the last 7 of 10 steps do not count
     assert returns.steps_until_negligible(0.5) == 7
     assert returns.known_steps(10, terminated=False, gamma=0.5) == 3
     assert returns.known_steps(5, terminated=False, gamma=0.5) == 0
@@ -79,7 +79,7 @@ def test_near_the_time_limit_no_step_counts_however_the_episode_ends():
     assert returns.known_steps(9, terminated=True, gamma=0.5, limit=10) == 3
     assert returns.known_steps(2, terminated=True, gamma=0.5, limit=10) == 2
     assert returns.known_steps(5, terminated=True, gamma=0.5, limit=6) == 0
-    assert returns.known_steps(12, terminated=False, gamma=0.5, limit=20) == 5  # cut off by something else
+    assert returns.known_steps(12, terminated=False, gamma=0.5, limit=20) == 5  # truncated, but not by the limit
     assert returns.known_steps(5, terminated=True, gamma=1.0) == 5
     assert returns.known_steps(5, terminated=True, gamma=1.0, limit=10) == 0
 
@@ -101,7 +101,7 @@ def test_right_quantiles_are_calibrated_and_moved_ones_are_not():
         return explain.summarise([explain.Episode(np.arange(50_000), z, np.zeros(50_000, int), returns)])
 
     assert summary(0.0)["calibration_error"] < 0.01
-    assert summary(10.0)["calibration_error"] == pytest.approx(0.5, abs=1e-3)  # all returns are below: mean of 1 − τ
+    assert summary(10.0)["calibration_error"] == pytest.approx(0.5, abs=1e-3)  # all below all quantiles: mean of 1 − τ
     assert summary(10.0)["overestimation"] - summary(0.0)["overestimation"] == pytest.approx(10)
 
 
@@ -154,7 +154,7 @@ def test_every_step_has_the_same_weight():
 
     found = explain.summarise([episode(10, 5.0), episode(90, -1.0)])
     assert found["overestimation"] == pytest.approx((10 * 5 - 90) / 100)
-    # Of the levels 1/8, 3/8, 5/8, 7/8, nine tenths of the returns are above all quantiles and a tenth below
+    # Nine tenths of the returns are above all quantiles and a tenth below: 0.1 at each level of 1/8, 3/8, 5/8, 7/8
     assert found["calibration_error"] == pytest.approx(np.abs(0.1 - (np.arange(4) + 0.5) / 4).mean())
 
 
@@ -187,11 +187,11 @@ def test_unknown_returns_can_be_drawn():
     figure = figures.make_figure([unknown], "title", lam=1.0)
     assert figures.render(figure).ndim == 3
     (calibration,) = (axes for axes in figure.axes if axes.get_title(loc="left").startswith("Calibration"))
-    assert len(calibration.lines) == 1  # the diagonal alone
+    assert len(calibration.lines) == 1  # only the diagonal
 
 
 def test_episodes_too_short_to_know_a_return_leave_no_trace_in_the_log(tmp_path, monkeypatch):
-    """As Pendulum's, which a time limit of 200 steps ends."""
+    """Pendulum's are: a time limit ends them after 200 steps."""
     monkeypatch.setattr(critic_evaluation, "_SHARE", 1e9)
     argv = ["--env", "Pendulum-v1", "-n", 60, "-f", tmp_path, "--eval-freq", 50, "--eval-episodes", 1, "--verbose", 0]
     assert train.main([str(a) for a in [*argv, "-params", "learning_starts:100"]]) == 0
@@ -224,7 +224,7 @@ def test_play_goes_on_behind_the_time_limit_and_shows_what_lies_before():
     episodes = explain.record_episodes(make_model(env), env, 2, limit=20)
     for episode in episodes:
         assert len(episode.steps) == len(episode.quantiles) == 20
-        np.testing.assert_allclose(episode.returns, 10, rtol=0.011)  # 1/(1 − γ), but for the last percent
+        np.testing.assert_allclose(episode.returns, 10, rtol=0.011)  # 1/(1 − γ), except for an unseen tail of 1 %
 
 
 def test_rewards_are_those_that_the_critics_know():
@@ -254,7 +254,7 @@ def test_a_figure_of_any_number_of_critics():
         "Overestimation, 2 episodes",
         "Does σ mean uncertainty? 2 episodes",
         "What λ changes, 2 episodes",
-        *("", ""),  # the note, and nothing
+        *("", ""),  # the note, and empty axes
     ]
     height, width, channels = figures.render(figure).shape
     assert height > 100
@@ -264,13 +264,13 @@ def test_a_figure_of_any_number_of_critics():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run with normalised rewards, of the stochastic head and two evaluation environments."""
+    """A run of the stochastic head, with normalised rewards and two evaluation environments."""
     folder = tmp_path_factory.mktemp("logs")
     options = "policy_kwargs:{net_arch: [8], n_quantiles: 4}", "learning_starts:100", "batch_size:16", "normalize:true"
     argv = ["-n", 400, "--seed", 1, "-f", folder, "--eval-freq", 200, "--eval-episodes", 3, "--n-eval-envs", 2]
     argv += ["--env", "Hopper-v4", "--verbose", 0, "-params", *options, "stochastic_actor:true"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(critic_evaluation, "_SHARE", 1e9)  # no time to wait for figures
+        patch.setattr(critic_evaluation, "_SHARE", 1e9)  # draw figures however much of the time they take
         assert train.main([str(a) for a in argv]) == 0
     return folder / "tdc" / "Hopper-v4_1"
 
@@ -293,13 +293,13 @@ def test_a_figure_waits_until_it_takes_a_hundredth_of_the_time(tmp_path):
     (events,) = (tmp_path / "tdc" / "Hopper-v4_1").glob("events.out.tfevents.*")
     accumulator = EventAccumulator(str(events)).Reload()
     tags = accumulator.Tags()
-    # Of networks that have learned nothing, there is nothing to say
+    # Nothing is logged at step 100, before the critics have learned anything
     assert [event.step for event in accumulator.Scalars("eval/overestimation")] == [200]
-    assert tags["images"] == []  # of less than 200 s, not even the first fits
+    assert tags["images"] == []  # a run of less than 200 s has no time even for the first, estimated at 2 s
 
 
 def test_evaluations_hold_critics_against_the_normalised_returns(tmp_path, monkeypatch):
-    """What is logged is what one gets by playing the same episodes again."""
+    """The recorded episodes equal those from playing them again."""
     seen = []
     monkeypatch.setattr(critic_evaluation, "summarise", lambda episodes: seen.append(episodes) or {})
     monkeypatch.setattr(critic_evaluation, "EVERY", 1)

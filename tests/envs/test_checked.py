@@ -1,4 +1,4 @@
-"""Environments that fail in every way: in this process, in one of their own, and while they are made."""
+"""Environments that fail in every way: in this process, in a subprocess, and while they are made."""
 
 import multiprocessing
 import os
@@ -21,10 +21,10 @@ def raise_(error):
 
 class Answers(gym.Env):
     """
-    Return anything.
+    An environment that may return anything.
 
-    :param stepped: makes the answer of ``step``
-    :param begun: makes the answer of ``reset``
+    :param stepped: returns the answer of ``step``
+    :param begun: returns the answer of ``reset``
     """
 
     observation_space = spaces.Box(-1, 1, (3,))
@@ -48,7 +48,7 @@ GOOD = (np.zeros(3), 1.0, False, False, {})
 
 
 def changed(index, value):
-    """A good answer but for one of its five parts."""
+    """Return a good answer of ``step`` with one of its five parts replaced."""
     return (*GOOD[:index], value, *GOOD[index + 1 :])
 
 
@@ -152,10 +152,10 @@ def test_what_goes_wrong_in_closing_is_a_warning():
 
 @pytest.fixture
 def processes():
-    """Of two environments, of which the second is as asked for."""
+    """A function that makes two environments in processes, the second by the given function."""
     made = []
 
-    def make(second, start_method="fork"):  # forked processes hold each other's pipes: none is seen to be closed
+    def make(second, start_method="fork"):  # forked processes share pipes: a dead one goes unnoticed
         functions = [lambda: Monitor(CheckedEnv(Answers())), lambda: Monitor(CheckedEnv(second()))]
         made.append(CheckedSubprocVecEnv(functions, start_method))
         return made[0]
@@ -221,7 +221,7 @@ def test_a_process_that_ends_is_named_with_how(processes, end, sentence):
     with pytest.raises(EnvironmentFaultError, match=f"the process of environment 1 {sentence}"):
         env.step(np.zeros((2, 1)))
     with pytest.raises(EnvironmentFaultError, match=f"the process of environment 1 {sentence}"):
-        env.env_method("compute", 1)  # whatever is asked next
+        env.env_method("compute", 1)  # so does every later call
     with pytest.raises(EnvironmentFaultError, match=f"the process of environment 1 {sentence}"):
         processes(end, "forkserver")
 

@@ -37,7 +37,7 @@ def test_actions_without_bounds_are_normalised(envs):
     assert (envs.action_space.high == 1).all()
     model = TDC("MlpPolicy", envs, learning_starts=1000, seed=0)
     model.learn(20 * N_ENVS)
-    assert 0.5 < envs.unwrapped.largest_action <= 1  # what the simulator was given, of random actions
+    assert 0.5 < envs.unwrapped.largest_action <= 1  # the largest random action that the simulator received
 
 
 def test_bounds_of_the_task_stay(interface, monkeypatch):
@@ -55,14 +55,14 @@ def _with_the_space_of_the_task(begin):
 
 
 def test_last_observations_and_time_outs(envs, interface, recwarn):
-    """The point does not move: at the limit its last observation is its first, and the next episode's is another."""
+    """The points do not move: the last observation is the first, and the next episode starts elsewhere."""
     before = envs.reset().copy()
     for _ in range(LIMIT):
         observations, _, dones, infos = envs.step(np.zeros((N_ENVS, 2), np.float32))
     assert dones.all()
     assert not np.array_equal(observations, before)
     warned = [str(each.message) for each in recwarn if "compute_final_obs" in str(each.message)]
-    if interface == "fast_variant":  # gives the observation after the reset: no value to bootstrap from
+    if interface == "fast_variant":  # returns the observation after the reset: no bootstrapping
         assert not any(info["TimeLimit.truncated"] for info in infos)
         assert len(warned) == 1
     else:
@@ -115,7 +115,7 @@ def test_train(monkeypatch, tmp_path, capsys):
 
 
 def test_a_resumed_run_begins_new_episodes(monkeypatch, tmp_path):
-    """Everything else continues; what was stored of the episodes under way ends as if by a time limit."""
+    """Everything else continues; the stored parts of the interrupted episodes end as if by a time limit."""
     install(monkeypatch, "action_bounds")
     require_env(TASK)
 

@@ -14,7 +14,7 @@ def run(*arguments):
 
 
 def test_train_and_record(tmp_path):
-    """Nothing is imported otherwise, and neither PyBullet's greeting nor its connections are on the screen."""
+    """No package has to be named, and neither PyBullet's greeting nor its connection messages are printed."""
     params = ("-params", "learning_starts:20", "batch_size:8", "n_envs:2")
     arguments = ("--env", "HopperBulletEnv-v0", "-f", str(tmp_path), "--no-progress")
     trained = run(

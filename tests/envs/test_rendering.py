@@ -21,8 +21,8 @@ def test_the_camera_follows_the_agent(env_id):
     env = gym.make(env_id, render_mode="rgb_array")
     rendering.follow_agent(env)
     renderer = env.unwrapped.mujoco_renderer
-    assert renderer.model.camera(renderer.camera_id).name == "track"  # frames
-    assert renderer.model.body(renderer.default_cam_config["trackbodyid"]).name != "world"  # a window
+    assert renderer.model.camera(renderer.camera_id).name == "track"  # for recorded frames
+    assert renderer.model.body(renderer.default_cam_config["trackbodyid"]).name != "world"  # for a window
 
 
 def test_a_camera_that_was_asked_for_stays():
@@ -56,7 +56,7 @@ def test_glfw_without_a_display_is_said_to_be_none(monkeypatch):
 
 @pytest.mark.parametrize("options", [[], ["--vec-env", "gymnasium"], ["--vec-env", "subproc"]])
 def test_an_opengl_that_cannot_be_imported_is_a_sentence(tmp_path, options):
-    """In a process of its own: MuJoCo is imported once."""
+    """In a subprocess, since a process imports MuJoCo only once."""
     arguments = ["-f", tmp_path, "-n", 50, "--eval-freq", -1, "--verbose", 0, "--device", "cpu", *options]
 
     def train_on(env_id):
@@ -69,7 +69,7 @@ def test_an_opengl_that_cannot_be_imported_is_a_sentence(tmp_path, options):
     assert "error: MuJoCo cannot be imported with MUJOCO_GL=nothing (from the environment): unset it" in ended.stderr
     assert "Traceback" not in ended.stderr
     assert list(tmp_path.iterdir()) == []
-    assert train_on("Pendulum-v1").returncode == 0  # needs none
+    assert train_on("Pendulum-v1").returncode == 0  # needs no OpenGL
 
 
 # ---------------------------------------------------------------- environments of all kinds
@@ -122,7 +122,7 @@ class Fails(Undrawn):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A run of every kind."""
+    """A run on each of the environments above, by the name of its class."""
     folder = tmp_path_factory.mktemp("runs")
     found = {}
     for kind in (Undrawn, Drawn, NeedsPictures, Fails):
@@ -175,7 +175,7 @@ def test_a_gif_runs_as_fast_as_the_simulation(tmp_path, fps):
             video.add(np.full((8, 8, 3), i % 251, np.uint8))
     with Image.open(path) as gif:
         delays = [frame.info["duration"] for frame in ImageSequence.Iterator(gif)]
-    assert min(delays) >= 20  # players slow down what is shorter
+    assert min(delays) >= 20  # players slow down shorter delays
     assert sum(delays) / 1000 == pytest.approx(seconds, rel=0.11, abs=0.1)
 
 
@@ -211,7 +211,7 @@ def test_what_cannot_be_imported_draws_nothing_and_is_named():
 
 
 def test_a_display_that_is_gone_is_not_used(monkeypatch):
-    """As after ``ssh -X`` or in an old tmux: the variable is there, and nobody listens."""
+    """As after ``ssh -X`` or in an old tmux: the variable is set, but no server answers."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":987")

@@ -23,7 +23,7 @@ MODES = [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLE
 
 
 class Counts(gym.Env):
-    """Counts its steps; ends by itself, or by its time, after lengths that it was given."""
+    """Counts its steps; episodes of the given lengths terminate and are truncated in turn."""
 
     observation_space = gym.spaces.Dict(
         {"step": gym.spaces.Box(0, 100, (1,), np.float32), "episode": gym.spaces.Box(0, 100, (1,), np.float32)}
@@ -61,7 +61,11 @@ def alike(one, other):
 
 
 def compare(functions, vector, n_steps, action_space, seed=3):
-    """Step both with the same actions."""
+    """
+    Step both with the same actions, and compare all that they return.
+
+    :return: number of episodes that ended
+    """
     expected, found = DummyVecEnv(functions), GymnasiumVecEnv(vector)
     for env in (expected, found):
         env.seed(seed)
@@ -123,8 +127,9 @@ def test_processes_that_would_reset_twice_are_refused():
 @pytest.mark.parametrize("copy", [True, False])
 def test_no_transition_crosses_episodes(mode, copy):
     """
-    A step that only resets would be one with reward 0 from the last observation to the first, and what is stored after
-    the next step must not be what that step has written into the same memory.
+    A step that only resets would be a transition with reward 0 from the last observation to the first.
+
+    Without copies, every step writes into the same memory: stored observations must be those from before it.
     """
     env = VecMonitor(GymnasiumVecEnv(SyncVectorEnv([lambda: Counts([3])] * 2, copy=copy, autoreset_mode=mode)))
     model = TDC("MultiInputPolicy", env, learning_starts=1000, buffer_size=200, seed=0, device="cpu").learn(60)
@@ -133,12 +138,12 @@ def test_no_transition_crosses_episodes(mode, copy):
     filled = slice(0, buffer.pos)
     np.testing.assert_array_equal(now["episode"][filled], then["episode"][filled])
     np.testing.assert_array_equal(now["step"][filled] + 1, then["step"][filled])
-    assert (buffer.timeouts[filled].sum(), buffer.dones[filled].sum()) == (10, 20)  # every second ends by its time
+    assert (buffer.timeouts[filled].sum(), buffer.dones[filled].sum()) == (10, 20)  # every second episode is truncated
     assert [info["l"] for info in model.ep_info_buffer] == [3] * 20
 
 
 class Tensors(VectorEnv):
-    """A simulator on tensors that resets in the step that ends an episode, without attributes for its environments."""
+    """A simulator on tensors that resets in the step that ends an episode; its environments have no attributes."""
 
     metadata: ClassVar[dict] = {"autoreset_mode": AutoresetMode.SAME_STEP}
     render_mode = None
@@ -165,7 +170,7 @@ class Tensors(VectorEnv):
 
 
 class Together(VectorEnv):
-    """As Gymnasium's own on JAX: a seed is one number, all reset or none, and they reset in the step after the end."""
+    """As Gymnasium's JAX environments: one number as the seed, and all reset together in the step after the end."""
 
     render_mode = None
 
@@ -231,7 +236,7 @@ def test_hindsight_asks_one_of_the_environments(tmp_path):
     networks = ["policy_kwargs:{net_arch: [8]}", "learning_starts:40", "batch_size:8", "buffer_size:200"]
     Reach.n_calls = 0
     assert train.main([*argv, "--device", "cpu", "-params", *HINDSIGHT, *networks]) == 0
-    assert Reach.n_calls == 10  # steps of both after the first 40: one update each, with one call of one environment
+    assert Reach.n_calls == 10  # (60 − 40)/2 steps of both: each has one update with one call
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
@@ -249,7 +254,7 @@ def test_environments_that_take_one_seed_and_reset_together():
     seen = [env.reset()[1].tolist()]
     for _ in range(9):
         observations, rewards, dones, infos = env.step(np.zeros((3, 1), np.float32))
-        assert rewards[0] > 0  # that of the step that resets is none
+        assert rewards[0] > 0  # the step that only resets, with reward 0, is hidden
         seen.append(observations[1].tolist())
         assert dones[0] == (seen[-1][1] == 0)
         if dones[0]:
@@ -259,7 +264,7 @@ def test_environments_that_take_one_seed_and_reset_together():
 
 
 def test_a_run_in_a_vector_environment_is_played_in_one(tmp_path, capsys):
-    """There is no other."""
+    """No single environment has this id."""
     gym.register("Together-v0", vector_entry_point="tests.envs.test_vector:Together")
     options = ["--eval-freq", "150", "--eval-episodes", "1", "--device", "cpu", "-f", str(tmp_path), "-n", "200"]
     argv = ["--env", "Together-v0", *options, *SMALL_3]
@@ -295,7 +300,7 @@ def test_attributes_and_methods():
     assert env.get_attr("episode") == [7, 7]
     assert [step["step"].tolist() for step in env.env_method("_observe")] == [[0], [0]]
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
-    env.set_attr("episode", [8, 9], indices=0)  # a list is a value like others
+    env.set_attr("episode", [8, 9], indices=0)  # a list is a value like any other
     assert env.get_attr("episode") == [[8, 9], 7]
     env.set_attr("episode", 5, indices=0)
     assert [step["episode"].tolist() for step in env.env_method("_observe", indices=[1, 0])] == [[7], [5]]
@@ -310,7 +315,7 @@ def test_attributes_and_methods():
 
 
 class ResetsAll(SyncVectorEnv):
-    """Does not know ``reset_mask``, as with Gymnasium 1.0."""
+    """Ignores ``reset_mask``, as Gymnasium 1.0 does."""
 
     def reset(self, *, seed=None, options=None):
         return super().reset(seed=seed)
@@ -366,7 +371,7 @@ def test_a_training_with_it_resumes_exactly(tmp_path, monkeypatch):
 
 
 class Locked(Tensors):
-    """Holds what Python cannot see into."""
+    """Holds a lock, whose state Python cannot read."""
 
     def __init__(self):
         super().__init__()
@@ -388,12 +393,12 @@ def test_environments_that_cannot_be_captured_begin_new_episodes(tmp_path):
     assert "Continuing with new episodes" in said
     buffer = model.replay_buffer
     first = np.flatnonzero((buffer.observations[: buffer.pos, 0] == 0).all(axis=1))
-    ended = buffer.dones[first - 1, 0]  # before every first observation an episode ended, also where it was cut
+    ended = buffer.dones[first - 1, 0]  # an episode ended before each first observation, even at the interruption
     assert ended[first > 0].all()
 
 
 def test_an_info_of_all_environments_is_every_environment_s():
-    """As simulators with a log of all their environments return it."""
+    """As returned by simulators that keep one log for all their environments."""
     infos = {"log": {"return": 0.5}, "steps": np.array([1, 2, 3]), "name": "abc"}
     expected = [{"log": {"return": 0.5}, "steps": i, "name": "abc"} for i in (1, 2, 3)]
     assert split_infos(infos, 3) == expected

@@ -1,4 +1,4 @@
-"""Scores over tasks, of folders made by hand."""
+"""Scores over tasks, from run folders made by hand."""
 
 import itertools
 
@@ -57,7 +57,7 @@ def test_a_scaled_matrix_is_one_length(tmp_path):
     for algo in ("tdc", "sac"):
         for env_id, steps in (("Hopper-v4", 30_000), ("HalfCheetah-v4", 30_000), ("Walker2d-v4", 80_000)):
             make_shipped(tmp_path, algo, env_id, (1, 2), steps)
-    (found,) = aggregate.aggregate(read_groups(tmp_path))  # 2 % of all; two of them also have as many steps
+    (found,) = aggregate.aggregate(read_groups(tmp_path))  # 2 % of each task's steps; two tasks have equally many
     assert found.length == "2 % of the steps in hyperparams/"
     assert set(found.env_ids) == {"Hopper-v4", "HalfCheetah-v4", "Walker2d-v4"}
 
@@ -98,6 +98,6 @@ def test_those_with_the_most_runs_in_common_are_chosen(tasks):
 def test_choices_by_hand():
     assert aggregate.choose({"TDC": "ab", "TD3": "ab", "SAC": "cde"}) == (("TDC", "TD3"), ("a", "b"))
     assert aggregate.choose({"TDC": "abcde", "SAC": "abcde", "MEOW": "ab"}) == (("TDC", "SAC"), tuple("abcde"))
-    # Six runs either way: rather more algorithms than more tasks
+    # Six runs either way: more algorithms are preferred to more tasks
     assert aggregate.choose({"TDC": "abc", "SAC": "bca", "MEOW": "ab"}) == (("TDC", "SAC", "MEOW"), ("a", "b"))
     assert aggregate.choose({"TDC": "a", "SAC": "a"}) == ((), ())

@@ -1,4 +1,4 @@
-"""From a search to a page, through Ray, as a user goes: search → matrix → test returns → report."""
+"""From a search to a page, through Ray, in the order in which a user works: search → matrix → test returns → report."""
 
 import yaml
 

@@ -16,17 +16,17 @@ def examine_folder(folder):
 
 
 def number(n, folder):
-    """The comparisons for one of the claims."""
+    """Return the comparisons for claim ``n``."""
     return [claim for claim in examine_folder(folder) if claim.says.startswith(str(n))]
 
 
 def compare(folder):
-    """Of runs of one length on one task."""
+    """Return the comparisons of runs of one length on one task, by claim, quantity and sides."""
     return {(c.says[0], c.what.split()[0], *c.sides): c for c in examine_folder(folder)}
 
 
 def make_runs(folder, finals, algo="tdc", env_id="Hopper-v4", log=None, **changed):
-    """Runs with the hyperparameters of ``hyperparams/``, but for what is changed. Their last evaluation is late."""
+    """Make runs with the settings of ``hyperparams/`` except those given; only the last evaluation is a late one."""
     for seed, final in enumerate(finals, 1):
         make_run(folder, algo, env_id, seed=seed, returns=((0.0, 0.0), (final, final)), log=log, **changed)
 
@@ -47,7 +47,7 @@ def test_intervals_that_do_not_overlap_decide():
         (Interval(101, 99, 103, 3), "held"),  # at most 103 − 98 = 5 apart, and a tenth of 101 is 10.1
         (Interval(105, 95, 115, 3), "undecided"),  # perhaps 17 apart
         (Interval(120, 110, 130, 3), "undecided"),  # perhaps 8 apart
-        (Interval(101, 100.9, 101.1, 9), "held"),  # another number, but not by a tenth
+        (Interval(101, 100.9, 101.1, 9), "held"),  # different, but by less than a tenth
         (Interval(150, 140, 160, 3), "not held"),  # at least 38 apart, and a tenth of 150 is 15
         (Interval(101, np.nan, np.nan, 1), "undecided: too few seeds"),
     ],
@@ -62,7 +62,7 @@ def test_what_is_the_same_lies_within_a_tenth(other, verdict):
     [
         (Interval(130, 120, 140, 3), "held"),  # more
         (Interval(100, 97, 103, 3), "held"),  # the margin is 10: 97 ≥ 102 − 10
-        (Interval(95, 93, 97, 3), "held"),  # less, but not by a tenth
+        (Interval(95, 93, 97, 3), "held"),  # less, but by less than a tenth
         (Interval(100, 80, 120, 3), "undecided"),  # perhaps a fifth less
         (Interval(80, 75, 85, 3), "not held"),
         (Interval(500, np.nan, np.nan, 1), "undecided: too few seeds"),
@@ -73,7 +73,7 @@ def test_what_is_at_least_as_large_is_at_most_a_tenth_smaller(ours, verdict):
 
 
 def test_a_run_that_improves_does_not_scatter(tmp_path):
-    # The last third of twelve evaluations has four. About the line: 0 and ±1, ∓1, ±1, ∓1 less their own line
+    # The last third of twelve evaluations has four. Their scatter is that about their own fitted line
     rising = [(0.0,)] * 8 + [(10.0,), (20.0,), (30.0,), (40.0,)]
     zigzag = [(0.0,)] * 8 + [(1.0,), (-1.0,), (1.0,), (-1.0,)]
     few = [(0.0,)] * 4 + [(10.0,), (20.0,)]
@@ -98,10 +98,10 @@ def test_heads_are_judged_as_the_paper_says_of_the_task(tmp_path):
         make_runs(tmp_path, (199, 200, 201), env_id=env_id, stochastic_actor=True)
     found = {claim.group.env_id: claim for claim in number(4, tmp_path)}
     assert {env_id: claim.verdict for env_id, claim in found.items()} == {
-        "HalfCheetah-v4": "not held",  # the same
+        "HalfCheetah-v4": "not held",  # the paper: the same
         "Humanoid-v4": "not held",
-        "Ant-v4": "not held",  # deterministic
-        "Walker2d-v4": "held",  # stochastic
+        "Ant-v4": "not held",  # the paper: deterministic
+        "Walker2d-v4": "held",  # the paper: stochastic
     }
     make_runs(tmp_path / "alike", (99, 100, 101))
     make_runs(tmp_path / "alike", (100, 101, 102), stochastic_actor=True)
@@ -163,7 +163,7 @@ def test_other_physics_are_not_compared(tmp_path):
 
 
 def test_what_hyperparams_say_is_what_is_judged(tmp_path):
-    """In a folder of other runs, labels name what differs there, and not what differs from ``hyperparams/``."""
+    """A label names only what differs within its folder: here not λ, although it differs from ``hyperparams/``."""
     make_runs(tmp_path, (50, 51), algo="td3")
     make_runs(tmp_path, (100, 101), lam=0.0)
     assert compare(tmp_path) == {}

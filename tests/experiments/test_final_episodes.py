@@ -1,4 +1,4 @@
-"""Test episodes, held against the same ones played by hand."""
+"""Test episodes, compared with the same ones played by hand."""
 
 import gymnasium as gym
 import pytest
@@ -41,7 +41,7 @@ def test_a_model_that_needs_its_environment_to_be_loaded(tmp_path):
 
 
 class OwnExtractor(FlattenExtractor):
-    """A class that saved models may not name."""
+    """A custom class, which only a trusted model may name."""
 
 
 def test_a_model_with_a_class_of_the_user_is_tested_if_it_is_trusted(tmp_path, capsys):

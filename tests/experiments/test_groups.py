@@ -1,4 +1,4 @@
-"""Runs → groups that may be averaged, and what may be compared."""
+"""Which runs may be averaged as a group, and which groups may be compared."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_only_seeds_are_put_together(tmp_path):
 
 def test_what_is_said_and_what_is_the_default_are_the_same(tmp_path):
     make_run(tmp_path, seed=1)
-    make_run(tmp_path, seed=2, gamma=0.99, stochastic_actor=False)  # the constructor's own
+    make_run(tmp_path, seed=2, gamma=0.99, stochastic_actor=False)  # the constructor's defaults
     make_run(tmp_path, seed=3, kappa=1)  # not 1.0, but the same
     assert labels(tmp_path) == [("TDC", [1, 2, 3])]
 
@@ -87,7 +87,7 @@ def test_what_differs_from_the_hyperparameter_file_is_named(tmp_path):
 
 
 def test_a_run_that_a_callback_ended_is_finished_for_all_but_not_averaged(tmp_path):
-    """``train.py`` marks its runs; how many steps they have matters to averages alone."""
+    """``train.py`` marks its finished runs; their number of steps matters only for averages."""
     folder = make_run(tmp_path, steps=400, args={"resume_freq": 100})
     assert not find_runs(tmp_path)[0][0].is_finished
     folder.mark_finished(400)

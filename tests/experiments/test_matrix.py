@@ -47,7 +47,7 @@ def test_jobs_of_the_paper():
 
 def test_cells_of_two_suites_may_be_one_job():
     cells = [Cell("tdc", "Humanoid-v4", {"stochastic_actor": False}), Cell("tdc", "Humanoid-v4", {"lam": 1.0})]
-    jobs = planning.make_plan(cells, (1,), 1.0, Path("/logs")).jobs  # λ is 1 there, and the head deterministic
+    jobs = planning.make_plan(cells, (1,), 1.0, Path("/logs")).jobs  # hyperparams/ has λ = 1 and the deterministic head
     assert [(job.settings, job.logs) for job in jobs] == [({}, Path("/logs/scale_1/seed_1"))]
 
 
@@ -66,7 +66,7 @@ def test_other_simulators_are_missing_with_a_hint(monkeypatch):
 
 
 def test_scaled():
-    # HalfCheetah: 0.02 × 1,500,000 steps; 25,000 random steps are more than a tenth; evaluations at 1/30
+    # HalfCheetah: 0.02 × 1,500,000 steps; the 25,000 random steps are cut to a tenth of the run; 30 evaluations
     def cheetah(scale):
         (job,) = plan("fig1", scale=scale, only=["tdc", "HalfCheetah-v4"]).jobs
         return job
@@ -131,7 +131,7 @@ def test_another_run_in_the_place_of_a_job_is_not_taken(tmp_path):
 
 
 class RayOfThreads:
-    """What ``run_jobs`` uses of Ray, in threads of this process."""
+    """The part of Ray that ``run_jobs`` uses, with threads of this process."""
 
     exceptions = SimpleNamespace(RayError=RuntimeError)
 
@@ -158,7 +158,7 @@ def train_in_no_time(job):
 
 @pytest.mark.parametrize("finishes", [True, False])
 def test_a_run_that_another_process_trains_is_left_to_it(finishes, tmp_path, monkeypatch, capsys):
-    """The others go on meanwhile; if it stops before its end, the run is taken over."""
+    """The others continue meanwhile; if the other process stops before the end, its run is taken over."""
     monkeypatch.setattr(running, "_SECONDS_UNTIL_ASKED_AGAIN", 0.1)
     trained = []
     monkeypatch.setattr(running, "run", lambda job: trained.append(job.seed) or train_in_no_time(job))
@@ -298,7 +298,7 @@ def test_a_matrix_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
     out, status = finish(process)
     assert status == {signal.SIGKILL: -9, signal.SIGINT: 130}[how], out
     deadline = time.monotonic() + 30
-    while any(is_running(pid) for pid in family):  # nothing goes on alone
+    while any(is_running(pid) for pid in family):  # no run outlives the matrix
         assert time.monotonic() < deadline, [pid for pid in family if is_running(pid)]
         time.sleep(0.1)
     assert not all(r.is_finished for r in find_runs(tmp_path / "killed")[0])
@@ -325,7 +325,7 @@ def test_two_matrices_share_the_runs(tmp_path):
 
 @pytest.mark.skipif(not Path("/proc/self/autogroup").exists(), reason="Linux without groups of sessions")
 def test_a_run_keeps_the_niceness_of_the_matrix():
-    """It has a session of its own, which would otherwise be scheduled as if it were not nice at all."""
+    """A run has its own session, which Linux would otherwise schedule with a niceness of 0."""
     code = "import os; os.nice(7); from sb3_tdc.cli import job; job.keep_niceness()"
     code += "; print(open('/proc/self/autogroup').read())"
     done = subprocess.run([sys.executable, "-c", code], start_new_session=True, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""What of a run is published, that a report made from it says the same, and that the matrix does not run it again."""
+"""What is published of a run, that a report on it says the same, and that the matrix does not run it again."""
 
 import shlex
 import shutil
@@ -180,7 +180,7 @@ def test_results_are_not_published_over_the_runs(logs, capsys):
 
 
 def finish(run, steps=1000):
-    """A run that takes its place in a folder of results without being trained."""
+    """Mark a run as finished, so that it is published without being trained."""
     run.mark_finished(steps)
     return run
 
@@ -246,7 +246,7 @@ def test_a_part_of_a_log_folder_is_published_in_its_place(tmp_path, monkeypatch,
 
 def test_a_run_is_not_published_over_itself(tmp_path, capsys):
     run = finish(make_run(tmp_path / "logs", log={"train/lam": [1.0]}))
-    (run.path / "Hopper-v4.zip").unlink()  # as if it was published itself
+    (run.path / "Hopper-v4.zip").unlink()  # as if it were itself a published copy
     before = contents(tmp_path)
     assert publish.main([str(tmp_path / "logs" / "tdc"), "-o", str(tmp_path / "logs")]) == 1
     assert "logs/tdc/Hopper-v4_1 is itself a run" in capsys.readouterr().err

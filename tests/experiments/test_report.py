@@ -54,7 +54,7 @@ def test_what_lam_does_late_in_training(tmp_path):
         }
         make_run(tmp_path, seed=seed, lam=0.9, log=log)
     make_run(tmp_path, seed=3, lam=0.9, steps=500, log={"train/lam_changes": [1.0]})  # not finished
-    make_run(tmp_path, seed=1, lam=0.5, log={"train/lam": [0.5]})  # of a version that did not log more
+    make_run(tmp_path, seed=1, lam=0.5, log={"train/lam": [0.5]})  # from a version that logged nothing else
     make_run(tmp_path, algo="td3", log={"train/critic_loss": [1.0]})
     (row,) = tables.make_lam_table(read_groups(tmp_path)).to_dict("records")
     assert (row["Algorithm"], row["Seeds"]) == ("TDC", 2)
@@ -123,7 +123,7 @@ def test_the_axis_fits_what_is_drawn_but_a_huge_interval(log):
         found = draw(figures.draw_curves, [curve], "A", "return", log=log).get_ylim()
         return np.log(found) if log else found
 
-    assert limits([1.0, 4.0]) == pytest.approx([1 - 0.05 * 3, 4 + 0.05 * 3])  # Matplotlib's margin: no interval
+    assert limits([1.0, 4.0]) == pytest.approx([1 - 0.05 * 3, 4 + 0.05 * 3])  # no interval: just Matplotlib's margin
     # mean 2.5, interval 2.5 ± 12.7 × 1.5: cut at a third of the range of the seeds
     assert limits([1.0, 1.0], [4.0, 4.0]) == pytest.approx([1 - 3 / 3, 4 + 3 / 3])
 
@@ -245,7 +245,7 @@ def test_returns_are_kept_until_the_model_changes(logs, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(final_episodes, "play_final_episodes", None)  # nothing is played again
         assert final_episodes.measure_run(run, 3).tolist() == returns[:3].tolist()
-    assert final_episodes.measure_run(run, 6)[:4].tolist() == returns.tolist()  # the seeds decide, one by one
+    assert final_episodes.measure_run(run, 6)[:4].tolist() == returns.tolist()  # each episode depends on its seed alone
     model = run.folder.model.read_bytes()
     other = next(r for r in find_runs(logs)[0] if r.algo == run.algo and r.folder != run.folder)
     run.folder.model.write_bytes(other.folder.model.read_bytes())
@@ -285,7 +285,7 @@ def test_from_runs_to_a_page(logs, tmp_path, capsys):
         final_episodes.measure_run(run, 2)
     assert report_command.main([str(logs), "-o", str(tmp_path)]) == 0
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert not re.search(r"""(src|href)=["'](?!data:|#)""", page)  # nothing from elsewhere
+    assert not re.search(r"""(src|href)=["'](?!data:|#)""", page)  # nothing is loaded from elsewhere
     assert "url(" not in page
     assert "<script" not in page
     names = {path.name for path in (tmp_path / "figures").iterdir()}

@@ -1,4 +1,4 @@
-"""Folders of runs → settings and arrays."""
+"""Settings and arrays, read from run folders."""
 
 import inspect
 import shutil
@@ -109,7 +109,7 @@ def test_a_run_with_a_return_that_is_not_finite_is_not_averaged_anywhere(tmp_pat
 )
 def test_a_model_is_read_within_bounds(tmp_path, entries, reason):
     run = make_run(tmp_path)
-    (run.path / "Hopper-v4" / "versions.yml").unlink()  # of RL Zoo, whose system is that in the zip
+    (run.path / "Hopper-v4" / "versions.yml").unlink()  # as RL Zoo's runs, whose system is read from the zip
     assert Run.open(run.path).system == "OS: of the test · Python: 3"
     deflate = any(len(content or "") > 10**6 for content in entries.values())
     rewrite(shutil.copy(run.model, tmp_path / "model.zip"), run.model, deflate, **entries)
@@ -126,7 +126,7 @@ def test_a_run_of_rl_zoo_with_other_steps_on_its_command_line(tmp_path):
 
 
 def test_the_steps_in_force_are_those_of_the_edited_config(tmp_path):
-    """Of a run that was begun with ``-n 1000``, shortened to 600 steps before it was resumed, and has taken these."""
+    """A run started with ``-n 1000`` was shortened to 600 steps before it was resumed, and has taken all of them."""
     args = {"n_timesteps": 1000, "resume_freq": None}
     run = make_run(tmp_path, steps=600, n_timesteps=600, args=args, returns=((1.0,), (3.0,)))  # at 300 and 600
     run.mark_finished(600)

@@ -53,7 +53,11 @@ def test_spaces_that_are_none(text):
 
 
 def make_candidate(folder, lam, returns):
-    """:param returns: of each seed, the mean of every evaluation"""
+    """
+    Make the runs of a candidate, one for each seed.
+
+    :param returns: for each seed, the mean return of every evaluation
+    """
     jobs = []
     for seed, values in enumerate(returns, start=1):
         job = Job("tdc", "Hopper-v4", seed, 1500, folder / f"{lam}" / f"{seed}", {"lam": lam})
@@ -69,7 +73,7 @@ def test_ranking_by_hand(tmp_path):
     candidates = [
         make_candidate(tmp_path, 0.1, [[1, 3], [3, 5]]),  # means 2 and 4
         make_candidate(tmp_path, 0.2, [[4, 6], [5, 7]]),  # 5 and 6
-        make_candidate(tmp_path, 0.3, [[9, 1], [9]]),  # both have one evaluation
+        make_candidate(tmp_path, 0.3, [[9, 1], [9]]),  # both seeds have one evaluation
     ]
     table = ranking.rank(candidates, ["lam"])
     assert table["lam"].tolist() == [0.2, 0.1, 0.3]
@@ -125,7 +129,7 @@ STORED = """
 
 @pytest.fixture
 def stopped_search(tmp_path, monkeypatch):
-    """The folder of a search; none is run."""
+    """The folder of a stopped search; no trial is run."""
     monkeypatch.setattr(tune, "cluster", lambda *args: contextlib.nullcontext())
     monkeypatch.setattr(tune, "run_trials", lambda *args: (False, []))
     (tmp_path / "search.yml").write_text(STORED)
@@ -171,7 +175,7 @@ def test_a_search_is_run_by_one_process(stopped_search, monkeypatch, capsys):
     assert tune.main(["--resume", str(stopped_search)]) == 130
     assert f"Another process runs the search in {stopped_search}" in capsys.readouterr().err
     monkeypatch.setattr(tune, "run_trials", lambda *args: (True, []))
-    assert tune.main(["--resume", str(stopped_search)]) == 0  # it has let go of it
+    assert tune.main(["--resume", str(stopped_search)]) == 0  # the lock was released
 
 
 def test_a_closed_pipe_ends_no_search(stopped_search, monkeypatch, capsys):
@@ -207,7 +211,7 @@ def test_a_search_that_is_stopped_goes_on_to_the_same_end(tmp_path, how):
 
     process = start(*arguments(tmp_path / "killed", 2000), *options)
     deadline = time.monotonic() + 200
-    finished = "candidate_*/seed_*/tdc/*/*/finished.yml"  # not below: states come and go while one looks
+    finished = "candidate_*/seed_*/tdc/*/*/finished.yml"  # no rglob: states appear and disappear meanwhile
     while not list(killed.glob(finished)):
         assert process.poll() is None
         assert time.monotonic() < deadline

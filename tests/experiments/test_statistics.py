@@ -89,7 +89,7 @@ def test_returns_of_one_run():
 
 def test_interquartile_mean_drops_a_quarter_on_either_side():
     assert s.interquartile_mean(np.array([-100.0, 1.0, 3.0, 100.0])) == 2
-    assert s.interquartile_mean(np.array([0.0, 1.0, 8.0])) == 3  # a quarter of three is none
+    assert s.interquartile_mean(np.array([0.0, 1.0, 8.0])) == 3  # a quarter of three rounds down to none
     # Over tasks, all scores are one pool: of 0, 0, 1, 2, 3, 9, 9, 9 the middle four
     assert s.interquartile_mean(np.array([0.0, 9.0, 1.0, 9.0]), np.array([3.0, 0.0, 9.0, 2.0])) == (1 + 2 + 3 + 9) / 4
 
@@ -98,7 +98,7 @@ def test_bootstrap_resamples_seeds_within_tasks():
     # Each task is constant: whichever seeds are drawn, four scores of 0 and four of 1 stay, and their IQM is 0.5.
     # Drawn across tasks, the numbers of 0 and 1 would vary
     assert s.iqm_interval([np.zeros(4), np.ones(4)]) == (0.5, 0.5)
-    scores = [np.array([0.0, 1.0, 2.0, 3.0]), np.array([5.0, 6.0])]  # as many seeds as there are
+    scores = [np.array([0.0, 1.0, 2.0, 3.0]), np.array([5.0, 6.0])]  # tasks may differ in their number of seeds
     low, high = s.iqm_interval(scores, seed=3)
     assert 0 <= low < s.interquartile_mean(*scores) < high <= 6
     assert s.iqm_interval(scores, seed=3) == (low, high)

@@ -1,4 +1,4 @@
-"""What the paper ran, and which runs are of it."""
+"""The paper's suites, and which runs belong to their cells."""
 
 from sb3_tdc.experiments.results import find_runs
 from sb3_tdc.experiments.suites import SUITES, Cell

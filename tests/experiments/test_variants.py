@@ -15,7 +15,11 @@ from tests.helpers.run_folders import make_run
 
 
 def make_runs(folder, late, algo="tdc", **config):
-    """:param late: of each seed, both evaluations in the last third; the first one does not count"""
+    """
+    Make one run for each seed.
+
+    :param late: for each seed, both evaluations in the last third; the earlier ones, −999, do not count
+    """
     for seed, (one, other) in enumerate(late, 1):
         make_run(folder, algo, seed=seed, returns=((-999.0,), (-999.0,), (one,), (other,)), **config)
 
@@ -170,7 +174,7 @@ def test_a_schedule_has_its_curve_next_to_the_numbers(tmp_path):
 
 
 def test_other_settings_are_compared_with_those_of_the_file(tmp_path):
-    """λ and the head alone have comparisons of their own; without a control nothing is compared."""
+    """λ alone and the head alone are compared elsewhere; without a control nothing is compared."""
     late = [(1.0, 2.0), (2.0, 3.0), (4.0, 9.0)]
     for algo, config in (
         ("tdc", {}),
@@ -183,7 +187,7 @@ def test_other_settings_are_compared_with_those_of_the_file(tmp_path):
         ("td3", {"learning_starts": 25_000}),
         ("sac", {"tau": 0.5}),
         ("tdc", {"args": {"env_kwargs": {"healthy_reward": 9}}}),  # another task
-        ("tdc", {"args": {"trained_agent": "old.zip"}, "kappa": 10.0}),  # more steps
+        ("tdc", {"args": {"trained_agent": "old.zip"}, "kappa": 10.0}),  # trained before
         ("tdc", {"env_wrapper": "gymnasium.wrappers.FlattenObservation", "kappa": 10.0}),
     ):
         make_runs(tmp_path, late, algo, **config)
@@ -211,7 +215,7 @@ def test_other_settings_are_in_the_report(tmp_path):
 
 
 def test_figures_of_variants_and_of_settings_have_names_of_their_own(tmp_path):
-    """Of any settings: a name of a file has at most 255 bytes."""
+    """Even with many settings: a file name has at most 255 bytes."""
     pytest.importorskip("matplotlib")
     many = {"learning_rate": 1e-3, "qf_learning_rate": 2e-3, "buffer_size": 1234, "batch_size": 123, "gamma": 0.123}
     many |= {"target_policy_noise": 0.123, "target_noise_clip": 0.456, "gradient_steps": 3, "policy_delay": 3}

@@ -1,4 +1,4 @@
-"""The two commands from end to end, with small networks on Hopper."""
+"""``train`` and ``enjoy`` from end to end, with small networks on Hopper."""
 
 from sb3_tdc.cli import enjoy, train
 

@@ -1,8 +1,8 @@
 """
 Stand-ins for Isaac Lab: its modules, a task on tensors whose episodes are reset inside ``step``, its wrapper for SB3.
 
-The wrapper has each of the three interfaces in circulation, with what they do to actions without bounds and to the last
-observation of an episode.
+The wrapper has each of the three interfaces in circulation, which differ in how they treat actions without bounds and
+the last observation of an episode.
 """
 
 import sys
@@ -22,7 +22,7 @@ LIMIT = 5
 
 class Config:
     """
-    Of the task.
+    The configuration of the task.
 
     :param has_final_obs: whether this version knows ``compute_final_obs``
     """
@@ -37,7 +37,7 @@ class Config:
 class ReachTask(gym.Env):
     """Points that have to reach 0 in steps of ``dt``; beyond a distance of 3 they have failed."""
 
-    metadata: dict = {"render_modes": [None, "human", "rgb_array"]}  # noqa: RUF012  # as gymnasium has it
+    metadata: dict = {"render_modes": [None, "human", "rgb_array"]}  # noqa: RUF012  # as in gymnasium
 
     def __init__(self, cfg, render_mode=None):
         self.cfg, self.render_mode = cfg, render_mode
@@ -78,7 +78,7 @@ class ReachTask(gym.Env):
 
 
 class _Wrapper(VecEnv):
-    """What all interfaces have in common."""
+    """The part that all interfaces share."""
 
     knows_final_obs = True
 
@@ -157,9 +157,9 @@ WRAPPERS = dict(zip(INTERFACES, (_Oldest, _Middle, _Newest), strict=True))
 
 def install(monkeypatch, interface):
     """
-    Put a version of Isaac Lab where Python imports from; its tasks are registered once the application runs.
+    Make a stand-in for a version of Isaac Lab importable; its task is registered when the application is launched.
 
-    :return: what was launched: the arguments of each application, and ``sys.argv`` as it saw it
+    :return: for each application that is launched, its keyword arguments and ``sys.argv`` as it saw it
     """
     launched = []
 

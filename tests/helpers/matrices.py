@@ -1,4 +1,4 @@
-"""Real matrices and searches, in processes of their own."""
+"""Real matrices and searches, in subprocesses."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ SMALL = {"learning_starts": 20, "batch_size": 8, "buffer_size": 500}
 SMALL_TDC = {**SMALL, "policy_kwargs": {"net_arch": [8], "n_quantiles": 4}}
 
 
-# The matrix with a suite of its own: small networks on Pendulum, and one run that fails
+# The matrix command with custom suites: small networks on Pendulum, and one run that fails
 CODE = f"""
 import sys
 from sb3_tdc.experiments.suites import SUITES, Cell
@@ -41,7 +41,7 @@ def descendants(pid):
 
 
 def runs_of(pid):
-    """The processes of runs below one; Ray's own take their time to notice that it is gone."""
+    """Return the ids of the run processes below a process, without Ray's own, which notice late that it is gone."""
     family = {other: Path(f"/proc/{other}/cmdline").read_bytes() for other in descendants(pid)}
     return [other for other, command in family.items() if b"\0sb3_tdc\0job\0" in command]
 

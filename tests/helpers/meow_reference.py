@@ -1,5 +1,5 @@
 """
-One gradient step of MEOW, transcribed transition by transition in float64, for tests alone.
+One gradient step of MEOW, transcribed transition by transition in float64, for tests only.
 
 It shares nothing with the package but the values of the weights, which are plain lists of dicts of tensors.
 """
@@ -20,7 +20,7 @@ def layer_norm(layer, x):
 
 
 def network(layers, x):
-    """Linear, LayerNorm where there is one, x·σ(βx)."""
+    """Apply Linear, LayerNorm where there is one, and x·σ(βx) in turn."""
     for layer in layers[:-1]:
         x = linear(layer, x)
         if "norm_weight" in layer:
@@ -59,7 +59,7 @@ def gradient_step(weights, target, parameters, batch, *, alpha, gamma, low, high
     Change the parameters in place by the first step of Adam.
 
     :param batch: (s, a, r, s', d) per transition
-    :return: the loss
+    :return: the loss, and the norm of its gradient before clipping
     """
     loss = th.zeros((), dtype=th.float64)
     for s, a, r, s_next, d in batch:
@@ -70,5 +70,5 @@ def gradient_step(weights, target, parameters, batch, *, alpha, gamma, low, high
     norm = math.sqrt(sum(float((g**2).sum()) for g in gradients))
     for parameter, gradient in zip(parameters, gradients, strict=True):
         gradient = gradient * min(1.0, max_norm / norm)
-        parameter.data -= lr * gradient / (gradient.abs() + 1e-8)  # both moments are those of one gradient
+        parameter.data -= lr * gradient / (gradient.abs() + 1e-8)  # Adam's corrected moments after one step: g, g²
     return float(loss.detach()), norm

@@ -1,4 +1,4 @@
-"""Run folders as a training leaves them, made in no time."""
+"""Run folders as training leaves them, made without training."""
 
 import json
 import zipfile
@@ -13,10 +13,10 @@ NETWORKS = {"net_arch": [256, 256], "n_quantiles": 64}
 
 
 def shipped(algo="tdc", env_id="Hopper-v4", n_timesteps=1000):
-    """What ``hyperparams/`` has, shortened as the matrix does."""
+    """Return the entry of ``hyperparams/``, shortened as the matrix shortens it."""
     try:
         entry, _ = read_entry(hyperparams_file(algo), env_id)
-    except ValueError:  # of another package
+    except ValueError:  # an environment of another package
         entry = {}
     short = {"learning_starts": min(entry["learning_starts"], n_timesteps // 10)} if "learning_starts" in entry else {}
     return {**entry, **short, "n_timesteps": n_timesteps}
@@ -25,7 +25,12 @@ def shipped(algo="tdc", env_id="Hopper-v4", n_timesteps=1000):
 def make_run(
     folder, algo="tdc", env_id="Hopper-v4", seed=1, steps=1000, args=(), returns=((1.0, 3.0),), log=None, **config
 ):
-    """:param steps: taken; None if no model was saved; :param log: columns of progress.csv, at equal distances"""
+    """
+    Make the folder of a run.
+
+    :param steps: number of steps taken; None if no model was saved
+    :param log: columns of progress.csv, at equal distances
+    """
     run = RunFolder.create(folder, algo, env_id)
     config = {**shipped(algo, env_id, config.get("n_timesteps", 1000)), **config}
     run.write_config(config, {"algo": algo, "env": env_id, "seed": seed, **dict(args)})

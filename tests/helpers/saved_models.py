@@ -1,4 +1,4 @@
-"""A model of every kind that is saved and opened."""
+"""Models of every kind, to be saved and opened."""
 
 import gymnasium as gym
 import numpy as np

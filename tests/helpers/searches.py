@@ -1,4 +1,4 @@
-"""Real searches, in processes of their own."""
+"""Real searches, in subprocesses."""
 
 import subprocess
 import sys

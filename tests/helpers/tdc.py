@@ -54,7 +54,7 @@ def random_batches(n, seed=0, batch=BATCH):
 
 
 class BatchQueue:
-    """Stands in for the replay buffer: gives the batches of the test, in order."""
+    """Stands in for the replay buffer: returns the test's batches in order."""
 
     def __init__(self, batches):
         self.batches = iter(batches)
@@ -94,7 +94,7 @@ class BatchNormExtractor(BaseFeaturesExtractor):
 
 
 def states(model):
-    """Weights of all networks and all state of the optimizers, as a flat dict of float64 tensors."""
+    """Return the weights of all networks and all state of the optimizers, as a flat dict of float64 tensors."""
     found = {f"policy.{name}": weight for name, weight in model.policy.state_dict().items()}
     for name in ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer"):
         for i, state in model.get_parameters().get(name, {"state": {}})["state"].items():

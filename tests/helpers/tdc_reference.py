@@ -1,5 +1,5 @@
 """
-Algorithm 1 of the paper, transcribed loop by loop in float64, for tests alone.
+Algorithm 1 of the paper, transcribed loop by loop in float64, for tests only.
 
 It shares nothing with the package but the values of the weights. Every network is a plain list of layers
 ``[(W, b), ...]`` with ``W`` of shape (out, in); gradients come from autograd through the naive all-pairs loss.
@@ -28,7 +28,7 @@ def mean_action(actor, s, stochastic):
 
 
 def sample_action(actor, s, noise):
-    """Eq. 21 and its log density."""
+    """Return a sample of Eq. 21 and its log density."""
     h = th.clamp(mlp(actor["latent"], s), min=0.0)
     mu = actor["mu"][0] @ h + actor["mu"][1]
     log_std = th.clamp(actor["log_std"][0] @ h + actor["log_std"][1], LOG_STD_MIN, LOG_STD_MAX)
@@ -47,7 +47,7 @@ def quantiles(critic, s, a):
 
 
 def quantile_huber(z, y, kappa):
-    """Eq. 8–9, the mean over all pairs (k, j)."""
+    """Return the mean of Eq. 8–9 over all pairs (k, j)."""
     n, total = len(z), th.zeros((), dtype=th.float64)
     for k in range(n):
         level = (2 * (k + 1) - 1) / (2 * n)
@@ -64,7 +64,7 @@ def quantile_huber(z, y, kappa):
 
 
 def select(critics_quantiles, lam):
-    """Eq. 4–5."""
+    """Return the quantiles of the critic that Eq. 4–5 select."""
     best, best_score = None, None
     for z in critics_quantiles:
         mu = sum(z) / len(z)
@@ -116,7 +116,14 @@ class Reference:
         self.t = 0
 
     def update(self, batch, target_noise, actor_noise):
-        """batch: (s, a, r, s', d) per transition; noise: standard normal, per transition."""
+        """
+        Update the weights once.
+
+        :param batch: (s, a, r, s', d) per transition
+        :param target_noise: standard normal, per transition
+        :param actor_noise: standard normal, per transition
+        :return: the critics' loss
+        """
         self.t += 1
         loss = th.zeros((), dtype=th.float64)
         for (s, a, r, s_next, d), noise in zip(batch, target_noise, strict=True):

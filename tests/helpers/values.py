@@ -1,4 +1,4 @@
-"""Values of every kind, built from recipes, and a comparison of two of them that knows nothing of the code it tests."""
+"""Values of every kind, built from recipes, and a comparison that is independent of the code under test."""
 
 import collections
 import ctypes
@@ -44,7 +44,7 @@ class Node:
 
 
 class Names(dict):
-    """A dictionary of a user's own class."""
+    """A dictionary of a custom class."""
 
 
 def counter(start=0):
@@ -89,7 +89,7 @@ def cyclic():
 
 
 class Lends:
-    """An object whose memory numpy reaches by a protocol, as that of many libraries."""
+    """An object whose memory NumPy reaches through the array interface, as that of many libraries."""
 
     def __init__(self, numbers):
         self.array = np.array(numbers)
@@ -115,7 +115,7 @@ def lent_by_numba(numbers):
 LENT = [lent_by_ctypes, lent_by_mmap, lent_by_numba, lambda numbers: np.asarray(Lends(numbers))]
 
 
-# What every call makes again
+# Functions that build the value anew at every call
 LEAVES: dict[str, Any] = {
     **{repr(v): (lambda v=v: v) for v in (None, True, False, 0, -1, 1.5, -0.0, np.inf, "", "text", b"", b"\0\xff")},
     "nan": lambda: float("nan"),
@@ -221,7 +221,11 @@ def _object_array(items):
 
 
 def build(recipe: Any, built: list[Any] | None = None) -> Any:
-    """:param recipe: name of a leaf, or ("same", number), or (box, recipes)"""
+    """
+    Build the value of a recipe.
+
+    :param recipe: name of a leaf, or ("same", number) of a value built before, or (box, recipes)
+    """
     built = [] if built is None else built
     if isinstance(recipe, str):
         value = LEAVES[recipe]()
@@ -234,7 +238,7 @@ def build(recipe: Any, built: list[Any] | None = None) -> Any:
 
 
 def alike(a: Any, b: Any) -> bool:
-    """Whether two graphs of objects have the same classes and values, and share what they share."""
+    """Return whether two graphs of objects have the same classes and values, and share objects and memory alike."""
     arrays: list[tuple[Any, Any]] = []
     result = _alike(a, b, {}, {}, arrays)
     for i, (x, y) in enumerate(arrays):
@@ -257,7 +261,7 @@ def _alike(a: Any, b: Any, there: dict[int, Any], back: dict[int, Any], arrays: 
     def same(x: Any, y: Any) -> bool:
         return _alike(x, y, there, back, arrays)
 
-    if not isinstance(a, (tuple, frozenset, types.MethodType)):  # what can be told apart
+    if not isinstance(a, (tuple, frozenset, types.MethodType)):  # objects whose identity matters
         if id(a) in there or id(b) in back:
             return there.get(id(a)) is b and back.get(id(b)) is a
         there[id(a)], back[id(b)] = b, a

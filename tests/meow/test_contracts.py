@@ -106,7 +106,7 @@ def test_the_learning_rate_follows_its_schedule():
     model.learn(20)
     (group,) = model.policy.optimizer.param_groups
     assert group["lr"] == pytest.approx(0.0, abs=1e-9)
-    model.learn(10, reset_num_timesteps=False)  # 20 of 30 done, and the last update at the end
+    model.learn(10, reset_num_timesteps=False)  # continues at 20 of 30 steps, with the last update at the end
     assert group["lr"] == pytest.approx(0.0, abs=1e-9)
     model.learning_rate = 5e-4
     model.train(1, 8)

@@ -20,7 +20,7 @@ def draw(action_dim, n=7, obs_dim=3):
 
 @DIMENSIONS
 def test_q_minus_v_is_the_log_density(make_policy, action_dim):
-    """The density is computed on its own: a diagonal Gaussian of z by torch, and the Jacobian by autograd."""
+    """The density is computed independently: a diagonal Gaussian of z by torch, and the Jacobian by autograd."""
     network = make_policy(action_dim=action_dim).network
     obs, actions = draw(action_dim)
     q, v = network(obs, actions)
@@ -58,7 +58,7 @@ def test_the_density_integrates_to_one(make_policy):
 
 
 def test_v_is_the_soft_maximum_of_q(make_policy):
-    """V = α log ∫ exp(Q/α) da, which nothing but Q enters; two dimensions."""
+    """V = α log ∫ exp(Q/α) da, from Q alone, in two dimensions."""
     network = make_policy(action_dim=2).network
     u = th.linspace(-6.1, 6.1, 401, dtype=th.float64)
     grid = th.cartesian_prod(u, u)
@@ -121,7 +121,7 @@ def test_samples_have_the_density(make_policy):
 
 @DIMENSIONS
 def test_the_deterministic_action_is_the_mode_before_the_tanh(make_policy, action_dim):
-    """Density of u = atanh a: no other action has more of it, and its gradient vanishes there."""
+    """The density of u = atanh a is largest there, and its gradient vanishes."""
     policy = make_policy(action_dim=action_dim)
     flow, obs = policy.network.flow, th.randn(1, 3, dtype=th.float64)
 

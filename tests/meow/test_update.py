@@ -1,4 +1,4 @@
-"""The update against an independent transcription, and what it may and may not move."""
+"""The update against an independent transcription, and which weights it may change."""
 
 import copy
 import functools
@@ -22,7 +22,7 @@ def make_model(**kwargs):
     policy_kwargs = {"net_arch": [8, 6], "shift_arch": [7, 5], "log_std_min": LOW, "log_std_max": HIGH}
     kwargs = {"policy_kwargs": {**policy_kwargs, "dropout": 0.0}, "seed": 3, "buffer_size": 500, **kwargs}
     model = MEOW("MlpPolicy", TwoActions(), device="cpu", **kwargs)
-    with th.no_grad():  # away from the zeros of the beginning, and targets away from the networks
+    with th.no_grad():  # away from the initial zeros, and the targets away from the networks
         for network in (model.network, model.network_target):
             for parameter in network.parameters():
                 parameter.add_(0.2 * th.randn_like(parameter))
@@ -35,7 +35,11 @@ def train(model, batches, steps=1):
 
 
 def layers_of(modules, index=None):
-    """The layers of a Sequential as the transcription has them; of one of several stacked networks, with its index."""
+    """
+    Return the layers of a Sequential in the form of the transcription.
+
+    :param index: which one of several stacked networks
+    """
 
     def double(tensor):
         tensor = tensor.detach().double().clone()
@@ -109,7 +113,7 @@ def test_logged_values_are_those_of_the_equations():
 
 
 def test_gradients_reach_every_parameter():
-    """Weights that start at 0 pass nothing on to the layers before them; three updates later they do."""
+    """Weights that start at 0 pass no gradient to the layers before them; after three updates they do."""
     model = MEOW("MlpPolicy", TwoActions(), seed=0, buffer_size=500, device="cpu")
     train(model, random_batches(4), steps=3)
     model.policy.optimizer.zero_grad(set_to_none=True)
@@ -134,7 +138,7 @@ def test_the_policy_is_the_same_whatever_the_reward_shifts():
 
 
 def record_modes(monkeypatch, network, method):
-    """Whether each call of a network's method found it in training mode."""
+    """Record whether each call of a network's method finds it in training mode."""
     modes, original = [], getattr(network, method)
 
     @functools.wraps(original)
@@ -155,7 +159,7 @@ def test_dropout_learns_and_neither_acts_nor_sets_targets(monkeypatch):
     model.predict(np.zeros(OBS, np.float32), deterministic=True)
     assert learning == [{True}] * 8
     assert targets == [{False}] * 8
-    assert acting.count({True}) == 8  # those within forward
+    assert acting.count({True}) == 8  # the calls by forward
     assert acting.count({False}) == 8 + 1  # samples after the warm-up, and the prediction
 
 

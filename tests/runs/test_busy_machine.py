@@ -31,7 +31,7 @@ class Machine:
         self.callback.model = self.model
 
     def collect(self, seconds=0.001):
-        """A rollout, with whatever else happens in it."""
+        """Pass the time of a rollout, with everything else that happens in it."""
         self.callback.on_rollout_start()
         self.seconds += seconds
         self.processor_seconds += seconds
@@ -44,7 +44,7 @@ class Machine:
         self.model._n_updates += updates
 
     def run(self, updates, seconds):
-        """Repeat these updates until so much time has passed."""
+        """Repeat these updates until ``seconds`` have passed."""
         end = self.seconds + seconds
         for milliseconds, processor_milliseconds in itertools.cycle(updates):
             if self.seconds >= end:
@@ -116,7 +116,7 @@ def test_updates_that_are_slow_for_another_reason_are_not_reported(machine, upda
 
 
 def test_pauses_outside_of_updates_do_not_count(machine):
-    """Evaluations and states burn one core for a while."""
+    """Evaluations and the writing of resume states keep one core busy for a while."""
     for _ in range(100):
         machine.run(QUIET, 1)
         machine.collect(seconds=20)
@@ -149,7 +149,7 @@ def test_the_number_of_gradient_steps_may_change(machine):
 
 @pytest.fixture
 def busy(monkeypatch):
-    """Clocks for real runs, by which an update takes 1 s every second time and 100 s every other."""
+    """Clocks for real runs, by which updates take 1 s and 100 s in turn."""
     readings, passed = itertools.count(), 0.0
 
     def read():
@@ -179,7 +179,7 @@ def test_train_prints_the_command_that_helps(tmp_path, capsys, busy, bar):
 
 
 def test_states_of_a_real_run_do_not_count(tmp_path, capsys, monkeypatch):
-    """The clocks move while a state is written, as far as in ``busy``, and by 1 s in an update."""
+    """The clocks advance by 100 s while a resume state is written, and by 1 s in an update."""
     passed = 0.0
 
     def pass_time(seconds):

@@ -1,4 +1,4 @@
-"""Run folders: made for a run, and removed with what was made for it alone."""
+"""Run folders: made for a run, and removed with the parent folders that were made for it alone."""
 
 import pytest
 
@@ -26,7 +26,7 @@ def test_a_folder_that_another_run_uses_by_now_stays(tmp_path):
     first, second = (RunFolder.create(tmp_path / "logs", "tdc", "Hopper-v4") for _ in range(2))
     first.remove()
     assert [path.name for path in (tmp_path / "logs" / "tdc").iterdir()] == ["Hopper-v4_2"]
-    second.remove()  # the folder of all runs was not made for it
+    second.remove()  # its parent folder was made for the first run
     assert (tmp_path / "logs" / "tdc").is_dir()
 
 

@@ -37,7 +37,7 @@ def test_a_terminal_without_a_size_has_a_bar_too(monkeypatch, rows, columns, wid
 
 
 def test_a_line_has_no_rate_of_hardly_any_steps(capsys):
-    """Right after a resume, often a single step, and an evaluation of some seconds."""
+    """Right after a resume, there is often a single step, and then an evaluation of several seconds."""
     model = TDC("MlpPolicy", "Pendulum-v1", buffer_size=100, policy_kwargs={"net_arch": [4]}, device="cpu")
     progress = ProgressCallback(bar=False)
     model.learn(99, callback=progress)

@@ -1,4 +1,4 @@
-"""The settings of a run: what is allowed, said before anything is made, and again when a run is resumed."""
+"""The settings of a run, checked before anything is made, and again when the run is resumed."""
 
 import pytest
 import torch as th
@@ -31,7 +31,7 @@ def test_numbers_that_mean_nothing_are_refused(tmp_path, capsys, flag, value, al
 
 
 def test_what_turns_something_off_is_allowed():
-    """RL Zoo's convention."""
+    """−1 is RL Zoo's convention."""
     check_settings(RunSettings(eval_freq=-1, save_freq=-1, resume_freq=-1, log_interval=0, num_threads=-1, seed=-1))
     check_settings(RunSettings(eval_freq=0, save_freq=0))
     assert RunSettings(resume_freq=-1).writes_states is False
@@ -53,7 +53,7 @@ def test_a_device_that_is_not_there_is_never_replaced_by_another(monkeypatch, n_
 
 @pytest.fixture
 def run(tmp_path):
-    """What a run that was stopped at its start leaves."""
+    """The folder of a run that was stopped at its start."""
     folder = RunFolder.create(tmp_path, "tdc", "Pendulum-v1")
     config = {"n_timesteps": 200, "learning_starts": 100, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}}
     settings = RunSettings(env="Pendulum-v1", seed=1, log_folder=str(tmp_path), eval_freq=-1, device="cpu")

@@ -1,4 +1,4 @@
-"""What users of SB3 rely on, whatever they are used to: their schedules, environments, callbacks, files and copies."""
+"""What users of SB3 rely on: their schedules, environments, callbacks, files and copies."""
 
 import copy
 import csv
@@ -90,7 +90,7 @@ def test_sb3s_linear_schedule_to_zero_is_zero_at_its_end():
     rates = []
     model = make(learning_rate=recorded, qf_learning_rate=schedule, lam=schedule)
     model.learn(200, callback=Each(lambda model: rates.append(model.critic.optimizer.param_groups[0]["lr"])))
-    assert min(asked) < 0  # or the test would be of nothing
+    assert min(asked) < 0  # otherwise the test would prove nothing
     assert min(rates) == 0
 
 
@@ -161,7 +161,7 @@ def test_noises_of_several_environments_stay_what_they_are():
 
 
 class Numbers(gym.Env):
-    """Observes a vector, a number of Discrete and a flag; ends with values of Python, not of numpy."""
+    """Observes a vector, a Discrete number and flags; its last observation has values of Python, not of NumPy."""
 
     observation_space = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "n": spaces.Discrete(5), "m": spaces.MultiBinary(2)})
     action_space = spaces.Box(-1, 1, (2,))
@@ -321,7 +321,7 @@ def test_an_environment_of_openai_gym_is_converted_before_it_is_looked_at(monkey
 
 
 class Masked(BaseFeaturesExtractor):
-    """With a constant that is infinite by design, and statistics of its inputs."""
+    """An extractor with a constant that is infinite by design, and with running statistics of its inputs."""
 
     def __init__(self, observation_space):
         super().__init__(observation_space, observation_space.shape[0])
@@ -356,7 +356,7 @@ def test_an_infinite_constant_is_saved_and_loaded(tmp_path, shared):
 
 
 def test_both_names_of_a_shared_parameter_are_looked_at():
-    """A file may have other values under each; the last one would count."""
+    """A file may have different values under them, of which the last would be loaded."""
     policy = make(policy_kwargs={"features_extractor_class": Masked, "share_features_extractor": True}).policy
     for name in ("actor.features_extractor.norm.bias", "critic.features_extractor.norm.bias"):
         assert find_non_finite(policy, {**policy.state_dict(), name: th.tensor([0.0, th.nan, 0.0])}) == [name]
@@ -404,7 +404,7 @@ def test_policies_are_copied_and_pickled_after_an_update(stochastic_actor, fused
 
 @pytest.mark.parametrize("algorithm", [TDC, SAC])
 def test_a_fixed_temperature_has_no_logarithm_and_no_optimizer(tmp_path, algorithm):
-    """What callbacks ask of SAC."""
+    """Callbacks written for SAC read these attributes."""
     head = {"stochastic_actor": True} if algorithm is TDC else {}
     for ent_coef in (0.2, "auto"):
         model = algorithm("MlpPolicy", TwoActions(), ent_coef=ent_coef, buffer_size=100, learning_starts=5, **head)
@@ -432,7 +432,7 @@ def test_the_deterministic_head_has_no_temperature(tmp_path):
         (0.5, "auto_0.1", 0.1),
         (0.5, "auto", 1.0),
         (0.5, 0.1, 0.1),
-        (0.5, 0.5, 0.25),  # the file's own
+        (0.5, 0.5, 0.25),  # unchanged: the value in the file
         ("auto_0.5", "auto_0.5", 0.25),
         ("auto_0.5", "auto_0.1", 0.1),
     ],
@@ -528,7 +528,7 @@ def test_what_callbacks_read_after_an_update(stochastic_actor, fused):
 
     class Reads(BaseCallback):
         def _on_step(self):
-            if self.model._n_updates > 0:  # of train(), before this step
+            if self.model._n_updates > 0:  # train() ran before this step
                 values = self.logger.name_to_value
                 assert values["train/n_updates"] == self.model._n_updates
                 rates.append(values["train/learning_rate"])
@@ -556,7 +556,7 @@ def test_a_logger_that_a_callback_keeps_has_the_losses():
 
 
 class OnAnotherDevice(TDC):
-    """Its tensors are those of a device that must not be waited for."""
+    """Pretends that its tensors are on a device that must not be waited for."""
 
     def _record_training(self):
         cpu, self.device = self.device, th.device("meta")
@@ -575,7 +575,7 @@ def test_no_update_waits_for_the_device(monkeypatch):
     assert fetched == []
     assert logger.name_to_value["train/n_updates"] == 50  # known here without waiting
     assert "train/actor_loss" not in logger.name_to_value
-    assert model.logger.name_to_value["train/actor_loss"] != 0  # asked for
+    assert model.logger.name_to_value["train/actor_loss"] != 0  # read, and so fetched
     assert fetched == [50]
     assert model.logger.name_to_value["train/critic_loss"] > 0
     assert fetched == [50]  # nothing has come since
@@ -599,7 +599,7 @@ def test_means_are_those_since_the_last_entry():
     assert "train/actor_loss" not in model.logger.name_to_value
     add(actor_loss=7.0)
     assert model.logger.name_to_value["train/actor_loss"] == 7.0
-    # None was taken since the entry: the last one known, not SB3's default of 0
+    # No loss of the critics since the entry: the last known one, not SB3's default of 0
     assert model.logger.name_to_value["train/critic_loss"] == 8.0
     add(critic_loss=2.0)
     assert model.logger.name_to_value["train/critic_loss"] == 2.0

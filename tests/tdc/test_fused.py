@@ -1,4 +1,4 @@
-"""The fused update is the readable one, to float32 rounding, and leaves the same model behind."""
+"""The fused update equals the readable one up to float32 rounding, and leaves the same model."""
 
 import copy
 
@@ -84,7 +84,7 @@ def test_both_agree_while_learning(stochastic_actor, kwargs):
 
 
 def test_both_agree_where_batches_have_discounts_of_their_own():
-    """As those of n-step returns have; and where the next batch has none again."""
+    """As batches of n-step returns do, and also where the next batch has none again."""
     rng = np.random.default_rng(1)
     batches = list(random_batches(60))
     for batch in batches[::3]:
@@ -99,7 +99,7 @@ def test_both_agree_where_batches_have_discounts_of_their_own():
 
 @HEADS
 def test_switching_in_mid_run(stochastic_actor):
-    """Fused, readable, fused again: the state of the optimizers goes along."""
+    """Fused, readable, fused again: the state of the optimizers is kept."""
     reference = make_model(stochastic_actor=stochastic_actor, fused=False)
     switching = make_model(stochastic_actor=stochastic_actor, fused=True)
     for model in (reference, switching):
@@ -114,7 +114,7 @@ def test_switching_in_mid_run(stochastic_actor):
 
 @HEADS
 def test_saved_files_are_the_same(tmp_path, stochastic_actor):
-    """One saved by the fused update goes on under the readable one, and the other way round."""
+    """A model saved under the fused update continues under the readable one, and the other way round."""
     kwargs = {"stochastic_actor": stochastic_actor, "env": "Pendulum-v1"}
     for first, then in ((True, False), (False, True)):
         model = make(fused=first, **kwargs).learn(90)
@@ -268,7 +268,7 @@ def hook(model):
 @pytest.mark.parametrize("change", [replace_optimizer, freeze, decay, hook])
 @pytest.mark.parametrize("after", [0, 60], ids=["before learning", "in mid-run"])
 def test_what_a_user_changes_counts(change, after):
-    """As the readable update would do it, from the next step on."""
+    """It takes effect from the next step on, as with the readable update."""
     models = []
     for fused in (None, False):
         model = make(TwoActions(), fused=fused, seed=2)
@@ -316,7 +316,7 @@ def test_a_buffer_that_returns_fewer_transitions():
 @HEADS
 @pytest.mark.parametrize("fused", [False, True])
 def test_moments_about_to_be_denormal_become_zero(stochastic_actor, fused, monkeypatch):
-    """At the same update of both paths; all others stay, a NaN too."""
+    """At the same update on both paths; all other moments stay, even NaN."""
     monkeypatch.setattr("sb3_tdc.tdc.tdc.FLUSH_INTERVAL", 4)
     model = make_model(stochastic_actor=stochastic_actor, fused=fused)
     model.replay_buffer = BatchQueue(random_batches(6, batch=8))

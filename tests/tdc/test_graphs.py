@@ -1,4 +1,4 @@
-"""What a CUDA graph does with the fused update: no Python between the operations, numbers as they were captured."""
+"""The fused update as a CUDA graph runs it: no Python between the operations, numbers as they were captured."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ class Recording(TorchDispatchMode):
 
 
 class RecordedGraphs:
-    """In place of ``CudaGraphs``."""
+    """Stands in for ``CudaGraphs``."""
 
     def __init__(self):
         self.recordings = {}
@@ -83,7 +83,7 @@ def test_what_is_replayed_is_what_would_be_computed(stochastic_actor):
 
 
 def test_numbers_of_python_are_those_of_the_capture():
-    """Else the test above would prove nothing."""
+    """Otherwise the test above would prove nothing."""
     graphs, numbers, total = RecordedGraphs(), iter([1.0, 2.0]), th.zeros(())
 
     def add():
@@ -111,7 +111,7 @@ def test_a_change_of_what_is_captured_makes_new_graphs():
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 @HEADS
 def test_on_a_gpu(stochastic_actor):
-    """Graphs against the readable update there; random numbers come in another order, so after learning, roughly."""
+    """CUDA graphs against the same operations without graphs, with the same seeds after the same training."""
     model = make(TwoActions(), fused=True, device="cuda", stochastic_actor=stochastic_actor).learn(300)
     assert isinstance(model._fused_update.run, CudaGraphs)
     assert model._fused_update.packed_replay is not None

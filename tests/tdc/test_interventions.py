@@ -1,4 +1,4 @@
-"""Whatever a user does to a model counts from the next update on, with the fused update as with the readable one."""
+"""Whatever a user changes in a model takes effect from the next update on, fused or readable."""
 
 import copy
 import inspect
@@ -41,7 +41,7 @@ def with_optimizer(model, network):
     network.optimizer = th.optim.Adam(network.parameters(), lr=3e-4)
 
 
-# ---- each changes a model, and leaves a trace in CALLS if it is called
+# ---- each changes a model; what it puts there leaves a trace in CALLS when it is called
 
 
 def replace_a_layer(model):
@@ -298,7 +298,7 @@ def test_global_hooks_are_called(register):
     finally:
         handle.remove()
     train(model, 3)
-    assert model._fused_update is not None  # and it comes back
+    assert model._fused_update is not None  # the fused update is used again
 
 
 @pytest.mark.parametrize(
@@ -480,7 +480,7 @@ def test_a_method_of_the_buffer_that_is_replaced_is_called(name, on_class, monke
 
 
 def test_an_array_of_the_buffer_that_is_kept_elsewhere_stays_the_buffer_s():
-    """Whoever has it may write to it, and what is written is learned from."""
+    """Its holder may write to it, and the model has to learn from what is written."""
     for view in (slice(None), slice(0, 3)):
         buffer = plain_buffer()
         kept = buffer.rewards[view] if view.stop else buffer.rewards
@@ -528,7 +528,7 @@ def test_a_copied_model_learns_on_its_own(stochastic_actor):
     train(model, 1)
     reference = make_model(stochastic_actor=stochastic_actor, fused=True)
     train(reference, 1)
-    model.replay_buffer = None  # that of the test cannot be copied
+    model.replay_buffer = None  # the test's stand-in cannot be copied
     copied = copy.deepcopy(model)
     before = states(model)
     train(copied, 2)
@@ -542,7 +542,7 @@ def test_a_copied_model_learns_on_its_own(stochastic_actor):
 
 @pytest.mark.parametrize("fused", [None, False])
 def test_sb3s_learning_rate_schedule_is_read(fused):
-    """And a learning rate put in its place later."""
+    """So is a learning rate that replaces it later."""
     model = make(TwoActions(), fused=fused, learning_starts=10).learn(20)
     before = states(model)
     model.lr_schedule = lambda progress: 0.0

@@ -26,9 +26,9 @@ sizes = st.integers(1, 9)
 
 def arguments_of(name, rng, c, b, n, m):
     """
-    Arguments of a pass for C = c, B = b, N = n, M = m.
+    Make the arguments of a pass for C = c, B = b, N = n, M = m.
 
-    :return: tensors, numbers, how many of the tensors at the end are results
+    :return: tensors, numbers, and how many tensors at the end are results
     """
 
     def real(*shape, scale=3.0):
@@ -51,7 +51,7 @@ def arguments_of(name, rng, c, b, n, m):
         return [noise, real(b, n).tanh()], [0.5], 1
     if name == "sample_actions":
         return [real(b, n), real(b, n, scale=10), real(b, n), real(b, n), real(b, n)], [], 5
-    sample = real(b, n, scale=1).tanh()  # not where float32 leaves nothing of 1 − a²
+    sample = real(b, n, scale=1).tanh()  # away from ±1, where 1 − a² is lost to rounding in float32
     if name == "log_density":
         return [sample, real(b, n, scale=10), real(b, n), real(b)], [], 1
     if name == "tanh_gaussian_backward":
@@ -74,7 +74,7 @@ def test_a_compiled_loop_is_its_twin(name, seed, c, b, n, m, broken):
     results = []
     for loops in (kernels, None):
         tensors, numbers, n_results = arguments_of(name, np.random.default_rng(seed), c, b, n, m)
-        if broken:  # what is NaN must show in the same results
+        if broken:  # a NaN must show in the same results
             tensors[0].view(-1)[seed % tensors[0].numel()] = float("nan")
         Passes(loops)(TWINS[name], *tensors)(*numbers)
         results.append(tensors[-n_results:])

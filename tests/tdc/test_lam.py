@@ -68,7 +68,7 @@ def test_where_no_lam_changes_anything_there_are_no_quantiles():
 
 
 def test_dormant_units_by_hand():
-    # Means of |h|: 0, 4 and 8, of which 0.025 is 0.1; then 0.05 and 4.05, of which 0.025 is 0.05125
+    # Means of |h|: 0, 4 and 8, and 0.025 of their mean is 0.1; then 0.05 and 4.05, and 0.025 of their mean is 0.05125
     first, second = th.tensor([[0.0, 4.0, 6.0], [0.0, -4.0, 10.0]]), th.tensor([[0.05, 4.05]])
     assert dormant_share([first]).item() == pytest.approx(1 / 3)
     assert dormant_share([first, second]).item() == pytest.approx(2 / 5)
@@ -84,7 +84,7 @@ def test_activations_are_those_of_the_layers():
 
 
 class Pixels(TwoActions):
-    """What SB3 divides by 255."""
+    """Observations that SB3 divides by 255."""
 
     observation_space = gym.spaces.Box(0, 255, (4, 4, 3), np.uint8)
 

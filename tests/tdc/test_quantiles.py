@@ -14,7 +14,7 @@ KAPPAS = [0.0, 0.1, 1.0, 10.0]
 
 
 def all_pairs(current, target, kappa):
-    """Eq. 8–10 in float64 through all pairs; its gradient by autograd."""
+    """Return Eq. 8–10 in float64 through all pairs, and its gradient by autograd."""
     z = current.detach().double().requires_grad_()
     n = z.shape[2]
     levels = (2 * th.arange(1, n + 1, dtype=th.float64) - 1) / (2 * n)
@@ -100,7 +100,7 @@ def test_loss_matches_reference_on_any_values(current, target, kappa):
 
 
 def test_the_median_minimises_plain_quantile_regression():
-    """A property from outside: with N = 1 and κ = 0 the minimum is the sample median."""
+    """An independent property: with N = 1 and κ = 0 the minimum is the sample median."""
     target = th.tensor([[1.0, 2.0, 7.0, 50.0, 60.0]])
     z = th.zeros(1, 1, 1)
     for _ in range(400):

@@ -18,7 +18,7 @@ from tests.helpers.tdc import HEADS, TwoActions, assert_close, make, states
 
 
 def add_steps(buffers, count, rng):
-    """The same random transitions to all of them."""
+    """Add the same random transitions to all buffers."""
     n_envs = buffers[0].n_envs
     for _ in range(count):
         observation, next_observation = rng.normal(size=(2, n_envs, 3))
@@ -36,7 +36,7 @@ def make_buffer(n_envs=1, **kwargs):
 
 
 def draw(packed_replay, buffer, batch_size, steps):
-    """As SB3 would return it."""
+    """Draw a minibatch in the form that SB3 returns."""
     rows = packed_replay.rows[packed_replay.draw(buffer, batch_size, steps)]
     observations, actions, next_observations, rewards, dones, timeouts = rows.split([3, 2, 3, 1, 1, 1], dim=1)
     return ReplayBufferSamples(observations, actions, next_observations, dones * (1 - timeouts), rewards)
@@ -46,14 +46,14 @@ def draw(packed_replay, buffer, batch_size, steps):
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("kwargs", [{}, {"handle_timeout_termination": False}], ids=str)
 def test_returns_what_the_buffer_returns(n_envs, mirrored, kwargs):
-    """While it fills, wraps around, and stands full, from the same random numbers; packed after three steps."""
+    """While the buffer fills, wraps around and stays full, with the same random numbers; packed after three steps."""
     plain, packed = make_buffer(n_envs, **kwargs), make_buffer(n_envs, **kwargs)
     rng = np.random.default_rng(0)
     add_steps([plain, packed], 3, rng)
     packed_replay, steps = PackedReplay(packed), 3
     if mirrored:
         packed_replay.rows = packed_replay.host_rows.clone()
-    for added in (0, 1, 4, 2, 1, 0, 9, 5, 10, 3, 27):  # full exactly at the fourth
+    for added in (0, 1, 4, 2, 1, 0, 9, 5, 10, 3, 27):  # exactly full at the fourth
         add_steps([plain, packed], added, rng)
         steps += added
         np.random.seed(added)
@@ -62,13 +62,13 @@ def test_returns_what_the_buffer_returns(n_envs, mirrored, kwargs):
         samples = draw(packed_replay, packed, 20, steps)
         for name, got, want in zip(expected._fields, samples, expected, strict=True):
             assert got is want is None or th.equal(got, want.float()), (added, name)
-        np.random.seed(added)  # the buffer itself goes on working
+        np.random.seed(added)  # the buffer itself still works
         for name, got, want in zip(expected._fields, packed.sample(20), expected, strict=True):
             assert got is want is None or th.equal(got.float(), want.float()), (added, name)
 
 
 def test_the_arrays_of_the_buffer_are_the_rows():
-    """So that what is changed by hand counts, and what is saved is all; other arrays there are noticed."""
+    """Changes by hand count, a saved buffer is complete and no larger, and a replaced array is noticed."""
     buffer = make_buffer()
     add_steps([buffer], 5, np.random.default_rng(0))
     packed_replay = PackedReplay(buffer)
@@ -87,7 +87,7 @@ def test_the_arrays_of_the_buffer_are_the_rows():
 
 
 def test_buffers_and_models_are_freed():
-    """Their memory is most of what a process has, and many are made in one: of seeds, of trials, in notebooks."""
+    """They take most of a process's memory, and one process may make many: for seeds, for trials, in notebooks."""
     model = make(TwoActions(), fused=True, buffer_size=60).learn(150)
     assert model._fused_update.packed_replay is not None
     left = [weakref.ref(part) for part in (model, model.replay_buffer, model._fused_update.packed_replay)]

@@ -188,13 +188,13 @@ def test_critics_start_like_linear_layers_and_differ():
     critic = make(policy_kwargs={"net_arch": [256], "n_quantiles": 64}).critic
     first, last = critic.layers[0], critic.layers[-1]
     for layer, inputs in ((first, 4), (last, 256)):
-        bound = 1 / inputs**0.5  # of nn.Linear
+        bound = 1 / inputs**0.5  # nn.Linear's
         assert layer.weight.abs().max() <= bound
         assert layer.weight.std().item() == pytest.approx(bound / 3**0.5, rel=0.1)
         assert not th.equal(layer.weight[0], layer.weight[1])
 
 
-# ---------------------------------------------------------------- the same again
+# ---------------------------------------------------------------- reproducibility
 
 
 @HEADS

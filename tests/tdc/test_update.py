@@ -1,4 +1,4 @@
-"""The update against an independent transcription of Algorithm 1, and what it may and may not move."""
+"""The update against an independent transcription of Algorithm 1, and which weights it may change."""
 
 import copy
 
@@ -36,7 +36,7 @@ def actor_weights(actor):
 
 
 def critic_weights(critic):
-    """(out, in) weights and biases, critic by critic, as the reference keeps them."""
+    """Return (out, in) weights and biases, critic by critic, as the reference keeps them."""
     stacked = [layer for layer in critic.layers if hasattr(layer, "weight")]
     return [
         t.detach().double()
@@ -142,7 +142,7 @@ def test_actor_step_leaves_no_gradient_in_the_critics():
 
 
 def test_gradients_lie_in_memory_as_their_parameters_do():
-    """Which is not how a transposed product computes them, and which the fused Adam takes for granted."""
+    """A transposed product computes them in another layout, while the fused Adam assumes that of the parameters."""
     inputs, start = th.randn(2, 5, 4), th.randn(2, 3, 4)
 
     def transposed_product(weight):

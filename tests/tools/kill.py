@@ -30,7 +30,7 @@ from sb3_tdc import TDC
 from tests.helpers.paths import ROOT
 from tests.tools.runs import digest, files
 
-# train.py, that tells where it is when it is asked to (SIGUSR1), at once
+# train.py, which writes its stack at once when it receives SIGUSR1
 _CODE = """
 import faulthandler, signal, sys
 faulthandler.register(signal.SIGUSR1, open(sys.argv.pop(1), "w"))
@@ -52,7 +52,7 @@ _PHASES = {
 
 
 def arguments(folder: Path, steps: int) -> list[str]:
-    """:return: a run in which much happens: evaluations and states every second, a ring that is overwritten"""
+    """Return the arguments of an eventful run: evaluations and states every second, a ring buffer that wraps around."""
     small = ["policy_kwargs:{net_arch: [32, 32], n_quantiles: 8}", "learning_starts:100", "batch_size:32"]
     run = ["--env", "Hopper-v4", "-n", str(steps), "--seed", "1", "-f", str(folder), "--save-freq", "1000"]
     often = ["--eval-freq", "120", "--eval-episodes", "3", "--resume-freq", "60", "--log-interval", "1"]
@@ -63,8 +63,10 @@ def arguments(folder: Path, steps: int) -> list[str]:
 
 def start(args: list[str], stack: Path, directory: Path = ROOT) -> subprocess.Popen:
     """
-    :param stack: where the process writes its stack when it is asked to
-    :return: the process; its output goes through a pipe to another one, which writes the log
+    Start ``train.py``.
+
+    :param stack: file to which the process writes its stack on SIGUSR1
+    :return: the process; its output goes through a pipe to another process, which writes the log
     """
     log = stack.with_suffix(".log")
     command = [sys.executable, "-W", "ignore", "-c", _CODE, str(stack), *args]
@@ -78,7 +80,7 @@ def start(args: list[str], stack: Path, directory: Path = ROOT) -> subprocess.Po
     return process
 
 
-# How a run is stopped: signals, in their order, to its whole group; None ends the reader of its output
+# How a run is stopped: signals in order, to its whole process group; None kills the reader of its output
 WAYS: dict[str, list[signal.Signals | None]] = {
     "SIGKILL": [signal.SIGKILL],
     "SIGTERM": [signal.SIGTERM],
@@ -92,7 +94,7 @@ _STATUSES = {130, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGI
 
 
 def stop(process: subprocess.Popen, stack: Path, way: str) -> str:
-    """:return: what it was doing, or that it had ended"""
+    """Stop a run, and return what it was doing, or that it had ended."""
     if stack.exists():
         process.send_signal(signal.SIGUSR1)
         deadline = time.monotonic() + 1
@@ -114,7 +116,7 @@ def stop(process: subprocess.Popen, stack: Path, way: str) -> str:
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """:return: fingerprints of a finished run: weights, replay buffer, logs"""
+    """Return fingerprints of a finished run: weights, replay buffer, logs."""
     model = TDC.load(folder / "Hopper-v4.zip", device="cpu")
     model.load_replay_buffer(folder / "replay_buffer.pkl")
     found = {"weights": digest(model.policy.state_dict()), "updates": model._n_updates, "steps": model.num_timesteps}
@@ -138,8 +140,8 @@ class Series:
     """
     A run that is stopped again and again.
 
-    :param folder: of the series; the run lies in ``<folder>/<place>/tdc/Hopper-v4_1``
-    :param struck: what each stop was, and interrupted
+    :param folder: folder of the series; the run lies in ``<folder>/<place>/tdc/Hopper-v4_1``
+    :param struck: for each stop, how the run was stopped and what was interrupted
     """
 
     folder: Path
@@ -220,7 +222,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _wait(process: subprocess.Popen, stack: Path, until_it_trains: bool) -> None:
-    """Until it can tell where it is, which is before its imports, or until it says that it continues."""
+    """Wait until the process can report its stack, which is before its imports, or until it has begun to train."""
     log = stack.with_suffix(".log")
     while process.poll() is None and not stack.exists():
         time.sleep(0.005)

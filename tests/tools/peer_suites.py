@@ -22,7 +22,7 @@ import torch as th
 
 from sb3_tdc import TDC
 
-# Tests count on the defaults of the algorithm whose place TDC takes
+# Tests rely on the defaults of the algorithm whose place TDC takes
 _DEFAULTS = {"learning_starts": 100, "action_noise": None}
 _PEERS: dict[str, dict[str, Any]] = {
     "TD3": _DEFAULTS,
@@ -30,7 +30,7 @@ _PEERS: dict[str, dict[str, Any]] = {
     "TQC": {**_DEFAULTS, "stochastic_actor": True, "policy_delay": 1},
 }
 
-# Why tests are unfair to TDC, and which (file::test, a regular expression)
+# Tests that are unfair to TDC: the reason, and a regular expression of file::test
 _UNFAIR = {
     "requires gSDE (use_sde), which TDC does not have": (
         r"test_sde\.py::.*|test_run\.py::test_sde\[.*|test_spaces\.py::test_sde_multi_dim"
@@ -46,7 +46,7 @@ _OPTIONS = ["-p", "no:cacheprovider", "-ra", "-q", "-m", "not expensive"]
 
 
 def make_stand_in(name: str) -> type[TDC]:
-    """:return: TDC under the peer's name, which is in the ids of tests and the names of logs, with its defaults"""
+    """Return TDC with a peer's defaults and under its name, which is in the ids of tests and the names of logs."""
 
     def construct(self: TDC, *args: Any, **kwargs: Any) -> None:
         TDC.__init__(self, *args, **{**_PEERS[name], **kwargs})
@@ -62,7 +62,7 @@ TD3, SAC, TQC = STAND_INS.values()  # where a pickle looks for them
 
 
 class Plugin:
-    """Run the tests in which a stand-in takes part; those that are unfair must fail."""
+    """A pytest plugin that runs only the tests with a stand-in; the unfair ones among them must fail."""
 
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
         chosen = [item for item in items if takes_part(item)]
@@ -75,7 +75,7 @@ class Plugin:
 
 
 def takes_part(item: pytest.Item) -> bool:
-    """:return: whether a test is given a stand-in, or is given no algorithm and names one"""
+    """Return whether a test is given a stand-in, or is given no algorithm and names one."""
     assert isinstance(item, pytest.Function)
     callspec = getattr(item, "callspec", None)
     for name, value in (callspec.params if callspec is not None else {}).items():
@@ -85,19 +85,19 @@ def takes_part(item: pytest.Item) -> bool:
 
 
 def run_suite(source: Path, options: list[str]) -> int:
-    """:return: 0 if every test of an unpacked source distribution passes that is fair"""
+    """Run the tests of an unpacked source distribution, and return 0 if every fair one passes."""
     files = [str(file) for file in sorted(source.glob("tests/test_*.py")) if names_a_peer(file.read_text())]
     where = ["-c", str(source / "pyproject.toml"), "--rootdir", str(source)]
     return pytest.main([*_OPTIONS, *where, *files, *options], plugins=[Plugin()])
 
 
 def names_a_peer(text: str) -> bool:
-    """:return: whether a file of tests names an algorithm that has a stand-in"""
+    """Return whether a file of tests names an algorithm that has a stand-in."""
     return re.search(rf"\b({'|'.join(_PEERS)})\b", text) is not None
 
 
 def main(argv: list[str] | None = None) -> int:
-    """:return: 0 if every test passes that is fair"""
+    """Return 0 if every fair test passes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path, help="an unpacked source distribution; then options of pytest")
     arguments, options = parser.parse_known_args(argv)
@@ -106,7 +106,7 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"{source} is not an unpacked source distribution: it has no folder tests")
     stable_baselines3.TD3, stable_baselines3.SAC, sb3_contrib.TQC = TD3, SAC, TQC  # type: ignore[misc,assignment]
     th.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as scratch:  # some tests write to where they are
+    with tempfile.TemporaryDirectory() as scratch:  # some tests write into the working directory
         os.chdir(scratch)
         outcome = run_suite(source, options)
         os.chdir(source)

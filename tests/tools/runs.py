@@ -1,7 +1,7 @@
 """
-Small runs that are stopped and resumed, and fingerprints of all that they leave.
+Small runs that are stopped and resumed, and fingerprints of everything that they leave.
 
-``python -m tests.tools.runs {whole,stopped,resumed} FOLDER CASE...`` runs them in a process of its own.
+``python -m tests.tools.runs {whole,stopped,resumed} FOLDER CASE...`` runs cases in a separate process.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ from sb3_tdc.resume import Restorable, ResumeCallback
 
 STEPS = 300
 MUJOCO = ("HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4")
-# On the wall clock
+# Fields that depend on the wall clock
 _TIMES = ("t", "time/fps", "time/time_elapsed", "time/critics_elapsed")
 
 
@@ -66,7 +66,7 @@ class Reach(gym.Env):
 
 
 def bullet(env_id: str) -> Callable[..., gym.Env]:
-    """:return: what makes one of PyBullet's tasks, as a run does"""
+    """Return a function that makes one of PyBullet's tasks, as a run does."""
 
     def make(**env_kwargs):
         require_env(env_id)
@@ -78,7 +78,9 @@ def bullet(env_id: str) -> Callable[..., gym.Env]:
 @dataclass
 class Case:
     """
-    :param wrap: of the vectorised environment
+    One small run.
+
+    :param wrap: wraps the vectorised environment
     """
 
     env: Any = "Pendulum-v1"
@@ -99,7 +101,7 @@ def _make_case(env: str, n_envs: int, vec_env: type, stochastic: bool) -> Case:
     return Case(env, TDC, n_envs, vec_env, wrapper_class=wrapper_class, kwargs=kwargs)
 
 
-# {HalfCheetah, Hopper, Walker2d, Ant, Humanoid} × {one, two; in this process, in their own} × both heads
+# {HalfCheetah, Hopper, Walker2d, Ant, Humanoid} × {one, two} × {in this process, in subprocesses} × both heads
 CROSS = {
     f"{env}-{'subproc' if vec_env is SubprocVecEnv else 'dummy'}{n_envs}-{'gaussian' if stochastic else 'plain'}":
     _make_case(env, n_envs, vec_env, stochastic)
@@ -189,7 +191,7 @@ CASES = {**CROSS, **OTHERS, **PYBULLET}
 
 
 class Trace(BaseCallback):
-    """Every transition, digested; and a list that grows, as callbacks of users have."""
+    """Digests every transition into a list that grows, as callbacks of users have."""
 
     def __init__(self):
         super().__init__()
@@ -202,12 +204,14 @@ class Trace(BaseCallback):
 
 
 class Stop(Exception):  # noqa: N818
-    """As sudden as a kill, but the process stays for the next case."""
+    """Ends a run as suddenly as a kill, but the process stays for the next case."""
 
 
 class StopAt(BaseCallback):
     """
-    :param step: stop there, in the middle of a step
+    Stops a run in the middle of a step.
+
+    :param step: the timestep to stop at; None for no stop
     """
 
     is_captured = False
@@ -223,7 +227,7 @@ class StopAt(BaseCallback):
 
 
 def digest(value: Any) -> str:
-    """:return: of the bits of arrays, tensors and plain values, in any nesting"""
+    """Return a hash of the bits of arrays, tensors and plain values, in any nesting."""
     hashed = hashlib.sha256()
 
     def add(item: Any) -> None:
@@ -252,7 +256,7 @@ def _wrap(case: Case, env: Any) -> Any:
 
 
 def make_model(case: Case, folder: Path) -> Any:
-    """:return: the model of a case, with its environments and its logger"""
+    """Return the model of a case, with its environments and its logger."""
     env = make_vec_env(
         case.env,
         case.n_envs,
@@ -273,7 +277,7 @@ def make_model(case: Case, folder: Path) -> Any:
 
 
 def make_callbacks(case: Case, folder: Path, stop_at: int | None) -> list[BaseCallback]:
-    """:return: states, the trace, an evaluation, and the stop"""
+    """Return callbacks: resume states, the trace, an evaluation, a board where there is one, and the stop."""
     eval_env = _wrap(case, make_vec_env(case.env, 1, seed=4, env_kwargs=case.env_kwargs))
     if isinstance(eval_env, VecNormalize):
         eval_env.training = False
@@ -294,7 +298,7 @@ def make_callbacks(case: Case, folder: Path, stop_at: int | None) -> list[BaseCa
 
 
 def run(case: Case, folder: Path, stop_at: int | None = None) -> dict[str, Any]:
-    """:return: fingerprints, or nothing of a run that was stopped"""
+    """Run a case, and return its fingerprints; none if it was stopped."""
     folder.mkdir(parents=True, exist_ok=True)
     model = make_model(case, folder)
     callbacks = make_callbacks(case, folder, stop_at)
@@ -311,7 +315,7 @@ def run(case: Case, folder: Path, stop_at: int | None = None) -> dict[str, Any]:
 
 
 def fingerprints(model: Any, trace: Trace, evaluation: EvalCallback, folder: Path) -> dict[str, Any]:
-    """:return: of everything that must not differ, by name"""
+    """Return fingerprints of everything that must not differ, by name."""
     state_dicts, tensors = model._get_torch_save_params()
     found: dict[str, Any] = {"transitions": digest(trace.digests), "number of transitions": len(trace.digests)}
     for name in state_dicts:
@@ -342,7 +346,7 @@ def _attribute(model: Any, name: str) -> Any:
 
 
 def files(folder: Path) -> dict[str, Any]:
-    """:return: what the run's logs say, without what is on the wall clock"""
+    """Return the contents of the run's logs and evaluations, except what depends on the wall clock."""
     found: dict[str, Any] = {}
     for path in sorted(folder.glob("*.csv")):
         lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
@@ -368,7 +372,7 @@ def _member(path: Path, name: str) -> Any:
 
 
 def stopping_step(name: str, steps: int) -> int:
-    """:return: a step that looks random, after the first state with a weight update and before the last"""
+    """Return a step that looks random, after the first state with a weight update and before the last."""
     return 90 + int(hashlib.sha256(name.encode()).hexdigest(), 16) % (steps - 100)
 
 
@@ -383,5 +387,5 @@ def main(mode: str, folder: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    calibration.PERIOD = 20  # so that λ moves in so few steps
+    calibration.PERIOD = 20  # so that λ moves within the few steps of a case
     main(sys.argv[1], Path(sys.argv[2]), sys.argv[3:])
