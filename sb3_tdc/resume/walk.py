@@ -11,7 +11,7 @@ training began, and so will not exist when the run is resumed.
 import itertools
 import types
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -276,13 +276,17 @@ class Restore:
         return id(value) in self._whole
 
     @contextmanager
-    def names(self) -> Iterator[None]:
-        """Restore the texts in this block as names, not as relative paths: keys of dictionaries, columns of logs."""
-        locations, self.locations = self.locations, self.locations.of_names()
+    def texts(self, locations: Locations) -> Iterator[None]:
+        """Take the texts that are restored in this block for locations by another rule."""
+        before, self.locations = self.locations, locations
         try:
             yield
         finally:
-            self.locations = locations
+            self.locations = before
+
+    def names(self) -> AbstractContextManager[None]:
+        """Restore the texts in this block as names, not as relative paths: keys of dictionaries, columns of logs."""
+        return self.texts(self.locations.of_names())
 
     def begin(self, value: Any) -> None:
         """Register a value before its contents are restored, since they may refer to it."""

@@ -147,8 +147,16 @@ class Notes(BaseCallback):
         super().__init__()
         self.folder, self.path, self.label = str(folder), Path(folder), "a/b"
         self.newest = {"file": "", "files": [str(folder / "start.txt")]}
+        self.first = Path("none")
+
+        def name(step, folder=self.folder, *, path=self.path):
+            return f"{folder} {path} {step}"
+
+        self.name = name
 
     def _on_step(self):
+        if self.num_timesteps == 1:
+            self.first = self.path / "first.txt"
         self.newest["file"] = os.path.join(self.folder, f"{self.num_timesteps}.txt")
         self.newest["files"].append(self.newest["file"])
         self.label = f"step/{self.num_timesteps}"
@@ -193,7 +201,20 @@ def test_what_was_built_with_another_location_stays_as_it_is_built_now(tmp_path,
     assert (notes.folder, notes.path) == (str(tmp_path / "new"), tmp_path / "new")
     assert notes.newest["files"][:2] == [str(tmp_path / "new" / "start.txt"), "outside/1.txt"]
     assert notes.newest["files"][-1] == str(tmp_path / "new" / "100.txt")
+    assert (inside.first, notes.first) == (tmp_path / "moved" / "first.txt", Path("outside/first.txt"))
+    assert notes.name(1) == f"{tmp_path / 'new'} {tmp_path / 'new'} 1"
     assert inside.label == notes.label == "step/100"
+
+
+def test_a_run_that_was_moved_into_its_former_folder(tmp_path):
+    learn(tmp_path / "run", tmp_path / "outside", stop_at=50)
+    shutil.move(tmp_path / "run", tmp_path / "moved")
+    shutil.move(tmp_path / "moved", tmp_path / "run" / "copy")
+    folder = tmp_path / "run" / "copy"
+    inside, _ = learn(folder, tmp_path / "outside")
+    assert (inside.folder, inside.path, inside.first) == (str(folder), folder, folder / "first.txt")
+    assert inside.newest["files"][1] == str(folder / "1.txt")
+    assert inside.name(1) == f"{folder} {folder} 1"
 
 
 @pytest.mark.parametrize(

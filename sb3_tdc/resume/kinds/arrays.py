@@ -14,6 +14,7 @@ import torch as th
 from torch import nn
 
 from sb3_tdc.resume.kinds.containers import capture_items, items_of, restore_items
+from sb3_tdc.resume.locations import UNMOVED
 from sb3_tdc.resume.walk import MISSING, Capture, NotCapturedError, NotRestoredError, Restore, existing_as
 
 # ---------------------------------------------------------------- arrays
@@ -262,11 +263,13 @@ def capture_made(context: Capture, value: Any, path: str) -> Any:
 def restore_made(context: Restore, content: Any, existing: Any, path: str) -> Any:
     """Make a value from its parts."""
     name, parts = content
-    if issubclass(_MADE[name][0], pathlib.Path):
-        text = context.restore(parts[0], MISSING, path)
-        there = str(existing) if isinstance(existing, pathlib.PurePath) else MISSING
-        return _MADE[name][2](context.locations.find(text, there, f"{path}[0]", is_path=True))
-    return _MADE[name][2](*restore_items(context, parts, [], path))
+    kind, _, make = _MADE[name]
+    if not issubclass(kind, pathlib.Path):
+        return make(*restore_items(context, parts, [], path))
+    with context.texts(UNMOVED):  # found below, once
+        (text,) = restore_items(context, parts, [], path)
+    there = str(existing) if isinstance(existing, pathlib.PurePath) else MISSING
+    return make(context.locations.find(text, there, f"{path}[0]", is_path=True))
 
 
 def restore_integer(context: Restore, content: Any, existing: Any, path: str) -> Any:

@@ -133,7 +133,7 @@ def capture_function(context: Capture, value: types.FunctionType, path: str) -> 
         "name": f"{code_name(value)} {_digest(value.__code__)}",
         "cells": {n: context.capture(c.cell_contents, f"{path}:{n}") for n, c in cells.items() if _is_full(c)},
         "defaults": context.capture(value.__defaults__, f"{path} (its defaults)"),
-        "keywords": context.capture(value.__kwdefaults__, f"{path} (its defaults)"),
+        "keywords": context.capture(value.__kwdefaults__, f"{path} (by keyword)"),
         "attributes": context.capture_attributes(vars(value), path),
     }
 
@@ -152,8 +152,8 @@ def restore_function(context: Restore, content: Any, existing: Any, path: str) -
             value = context.restore(content["cells"][variable], before, f"{path}:{variable}")
             if value is not before:
                 cell.cell_contents = value
-    there.__defaults__ = context.restore(content["defaults"], there.__defaults__, path)
-    there.__kwdefaults__ = context.restore(content["keywords"], there.__kwdefaults__, path)
+    there.__defaults__ = context.restore(content["defaults"], there.__defaults__, f"{path} (its defaults)")
+    there.__kwdefaults__ = context.restore(content["keywords"], there.__kwdefaults__, f"{path} (by keyword)")
     context.restore_attributes(content["attributes"], there, path)
     return there
 
