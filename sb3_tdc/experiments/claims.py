@@ -1,7 +1,8 @@
 """
 The paper's claims, each examined on the available runs: what is compared, with which numbers, and the verdict.
 
-A verdict needs 95 % intervals over seeds that do not overlap; anything else is undecided. One seed decides nothing.
+A verdict on a difference needs 95 % intervals over seeds that do not overlap; one on equality, intervals that lie
+within a tenth of the returns, or farther apart. Anything else is undecided. One seed decides nothing.
 A claim is examined only on the tasks for which the paper makes it.
 """
 
@@ -93,9 +94,10 @@ def judge_at_least(ours: Interval, other: Interval) -> str:
     """Return the verdict on the claim that ours is larger, or smaller by at most a tenth of the larger mean."""
     if not (ours.is_known and other.is_known):
         return "undecided: too few seeds"
-    if ours.low >= other.high - _margin(ours, other):
+    margin = _margin(ours, other)
+    if ours.low >= other.high - margin:
         return "held"
-    return "not held" if other.is_above(ours) else "undecided"
+    return "not held" if ours.high < other.low - margin else "undecided"
 
 
 def judge_same(ours: Interval, other: Interval) -> str:

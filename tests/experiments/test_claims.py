@@ -64,7 +64,8 @@ def test_what_is_the_same_lies_within_a_tenth(other, verdict):
         (Interval(100, 97, 103, 3), "held"),  # the margin is 10: 97 ≥ 102 − 10
         (Interval(95, 93, 97, 3), "held"),  # less, but by less than a tenth
         (Interval(100, 80, 120, 3), "undecided"),  # perhaps a fifth less
-        (Interval(80, 75, 85, 3), "not held"),
+        (Interval(80, 75, 85, 3), "not held"),  # at least 13 less, and the margin is 10
+        (Interval(93, 89, 97, 3), "undecided"),  # less, but perhaps by 1 only
         (Interval(500, np.nan, np.nan, 1), "undecided: too few seeds"),
     ],
 )
