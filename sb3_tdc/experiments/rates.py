@@ -16,6 +16,7 @@ from sb3_tdc.runs.training import train
 
 # The steps between which time is measured: the first updates compile, allocate and warm up
 _FIRST_STEP, _LAST_STEP = 100, 300
+_LEARNING_STARTS = _FIRST_STEP // 2
 MEASURED_STEPS = _LAST_STEP - _FIRST_STEP
 
 
@@ -54,8 +55,8 @@ def measure_rate(job: Job) -> float:
     clock = _Clock()
     n_timesteps = max(_LAST_STEP, 10 * job.config.get("n_envs", 1))
     config = replace(job, n_timesteps=n_timesteps).config
-    # Also where the job sets it: the measured steps must include updates
-    config["learning_starts"] = min(config.get("learning_starts", _FIRST_STEP), _FIRST_STEP)
+    # Also where the job sets it: updates must begin before the measured steps
+    config["learning_starts"] = min(config.get("learning_starts", _LEARNING_STARTS), _LEARNING_STARTS)
     with tempfile.TemporaryDirectory() as folder:
         settings = RunSettings(
             algo=job.algo,
