@@ -1,10 +1,10 @@
-"""Discounted returns of finished episodes, and of which of their steps they are known."""
+"""Discounted returns of finished episodes, and the steps at which they are known."""
 
 import math
 
 import numpy as np
 
-# A return is known where at most this share of a discounted stream of rewards comes after the end of what was played
+# A return is known if at most this share of a constant, discounted stream of rewards lies after the last step played
 TOLERANCE = 0.01
 
 
@@ -13,7 +13,7 @@ def discounted_returns(rewards: np.ndarray, gamma: float, following: float = 0.0
     Return the discounted sum of the rewards from every step on, G_t = r_t + γ·G_{t+1}.
 
     :param rewards: (T,)
-    :param following: G_T, what comes after the last reward
+    :param following: G_T, the return after the last reward
     :return: (T,)
     """
     returns = np.empty(len(rewards))
@@ -28,16 +28,16 @@ def known_steps(
     """
     Return how many initial steps have a known discounted return, however the episode ended.
 
-    :param terminated: whether it ended by itself; after a time limit, there would have been more rewards
+    :param terminated: whether the episode ended by itself; after a time limit, there would have been more rewards
     :param limit: the time limit of the task. Steps closer to it than the discount horizon are excluded; otherwise only
         early failures would count there
-    :param tolerance: the largest weight γ^(T−t) of what was not seen
+    :param tolerance: the largest weight γ^(T−t) of the rewards that were not seen
     :return: between 0 and ``n_steps``
     """
     unseen = steps_until_negligible(gamma, tolerance) if gamma < 1 else math.inf
-    known = n_steps if terminated else n_steps - unseen
+    known = n_steps if terminated else n_steps - unseen + 1  # of the last of these, γ^unseen is not seen
     if limit is not None:
-        known = min(known, limit - unseen)
+        known = min(known, limit - unseen + 1)
     return int(max(known, 0))
 
 

@@ -64,22 +64,23 @@ def test_discounted_returns_are_the_sums(rewards, gamma):
 
 
 def test_a_truncated_episode_is_known_where_its_tail_weighs_nothing():
-    # 0.5^7 = 0.0078 is the first power of at most 0.01: the last 7 of 10 steps do not count
+    # 0.5^7 = 0.0078 is the first power of at most 0.01. What follows step 10 weighs 0.5^7 in the return from step 3 on,
+    # 0.5^6 in that from step 4 on: the steps 0, 1, 2, 3 count
     assert returns.steps_until_negligible(0.5) == 7
-    assert returns.known_steps(10, terminated=False, gamma=0.5) == 3
+    assert returns.known_steps(10, terminated=False, gamma=0.5) == 4
     assert returns.known_steps(5, terminated=False, gamma=0.5) == 0
     assert returns.known_steps(10, terminated=True, gamma=0.5) == 10
     assert returns.known_steps(10, terminated=False, gamma=1.0) == 0
-    assert returns.known_steps(10, terminated=False, gamma=0.0) == 9
+    assert returns.known_steps(10, terminated=False, gamma=0.0) == 10
 
 
 def test_near_the_time_limit_no_step_counts_however_the_episode_ends():
-    # 0.5^7 is negligible: of a task with a limit of 10 steps, the first 3 count
-    assert returns.known_steps(10, terminated=False, gamma=0.5, limit=10) == 3
-    assert returns.known_steps(9, terminated=True, gamma=0.5, limit=10) == 3
+    # 0.5^7 is negligible: of a task with a limit of 10 steps, the first 4 count
+    assert returns.known_steps(10, terminated=False, gamma=0.5, limit=10) == 4
+    assert returns.known_steps(9, terminated=True, gamma=0.5, limit=10) == 4
     assert returns.known_steps(2, terminated=True, gamma=0.5, limit=10) == 2
     assert returns.known_steps(5, terminated=True, gamma=0.5, limit=6) == 0
-    assert returns.known_steps(12, terminated=False, gamma=0.5, limit=20) == 5  # truncated, but not by the limit
+    assert returns.known_steps(12, terminated=False, gamma=0.5, limit=20) == 6  # truncated, but not by the limit
     assert returns.known_steps(5, terminated=True, gamma=1.0) == 5
     assert returns.known_steps(5, terminated=True, gamma=1.0, limit=10) == 0
 
