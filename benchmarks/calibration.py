@@ -1,8 +1,8 @@
 """
-What calibrating λ costs: ``python -m benchmarks.calibration`` prints its share of training time.
+The cost of calibrating λ: ``python -m benchmarks.calibration`` prints its share of training time.
 
-Processor time on one thread, on Hopper-v4 after a warm-up. Two whole trainings differ by more than this on a shared
-machine, so the calibration is timed where it happens.
+Measures processor time on one thread, on Hopper-v4 after a warm-up. On a shared machine, two whole trainings differ by
+more than this share, so the calibration is timed within a training.
 """
 
 import time

@@ -1,9 +1,9 @@
 """
-Environment steps per second against the number of environments, next to SB3's TD3.
+Environment steps per second against the number of environments, compared with SB3's TD3.
 
-``python -m benchmarks.collecting`` measures MuJoCo in one process and in processes of their own, and a task on tensors
-whose environments are stepped together; prints a table and writes it to ``docs/benchmarks/collecting.md``. Models are
-interleaved, each cell is the median of several rounds, on one thread.
+``python -m benchmarks.collecting`` measures MuJoCo in one process and in one process per environment, and a task on
+tensors whose environments are stepped together. It prints a table and writes it to ``docs/benchmarks/collecting.md``.
+The models take turns, on one thread; each cell is the median of several rounds.
 """
 
 import argparse
@@ -33,7 +33,7 @@ WARM_UP = 3  # steps of all environments
 
 
 class Points(VectorEnv):
-    """Linear dynamics on tensors, in episodes of 200 steps that end at different times: next to nothing to simulate."""
+    """A very cheap task: linear dynamics on tensors, in episodes of 200 steps that end at different times."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
@@ -67,8 +67,10 @@ class Points(VectorEnv):
 @dataclass(frozen=True)
 class Cell:
     """
-    :param steps: of all environments, in one round
-    :param updates: gradient steps for each
+    One row of the table.
+
+    :param steps: steps of all environments together, in one round
+    :param updates: gradient steps for each of these steps
     """
 
     what: str
@@ -98,7 +100,7 @@ def cells() -> Iterator[Cell]:
 
 
 class Clock(BaseCallback):
-    """The seconds of the steps after the first ones."""
+    """A callback that measures the seconds of the steps after the warm-up."""
 
     def _on_training_start(self) -> None:
         self.start, self.first = 0.0, self.num_timesteps
@@ -132,14 +134,14 @@ def make_model(algorithm: Any, cell: Cell) -> Any:
 
 
 def measure(cell: Cell, rounds: int) -> dict[str, float]:
-    """:return: environment steps per second by algorithm, medians of interleaved rounds"""
+    """Return environment steps per second by algorithm, as medians of interleaved rounds."""
     models = {"TDC": make_model(TDC, cell), "TD3": make_model(TD3, cell)}
     rates: dict[str, list[float]] = {name: [] for name in models}
     for i in range(rounds + 1):
         for name, model in models.items():
             clock = Clock()
             model.learn((WARM_UP + cell.steps) * cell.n_envs, callback=clock, reset_num_timesteps=False)
-            if i > 0:  # the first allocates and compiles
+            if i > 0:  # the first round allocates and compiles
                 rates[name].append(cell.steps * cell.n_envs / clock.seconds)
     for model in models.values():
         model.env.close()

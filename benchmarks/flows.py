@@ -1,7 +1,7 @@
 """
-``python -m benchmarks.flows``: gradient steps of MEOW next to SB3's SAC, and its couplings next to zuko's.
+``python -m benchmarks.flows``: gradient steps of MEOW compared with SB3's SAC, and its couplings with zuko's.
 
-As in :mod:`benchmarks.speed`, all are timed in one process, in turn. zuko is left out where it is missing:
+As in :mod:`benchmarks.speed`, all are timed in turn in one process. zuko is left out if it is not installed:
 ``pip install "sb3-tdc[bench]"``.
 """
 
@@ -18,7 +18,7 @@ ENV, BATCH, BLOCKS, WIDTHS = "HalfCheetah-v4", 256, 2, (64, 64)
 
 
 def gradient_steps() -> dict[str, Callable[[int], None]]:
-    """Return functions for ``time_calls``: gradient steps of MEOW and SAC, with the networks of their papers."""
+    """Return gradient steps of MEOW and SAC for ``time_calls``, with the networks of their papers."""
     from stable_baselines3 import SAC
 
     from sb3_tdc import MEOW
@@ -31,7 +31,7 @@ def gradient_steps() -> dict[str, Callable[[int], None]]:
 
 
 def couplings(features_dim: int = 17, action_dim: int = 6) -> dict[str, Callable[[int], None]]:
-    """Return the same for the couplings alone: the inverse with its log-determinant, and the backward pass."""
+    """Return the couplings alone for ``time_calls``: the inverse with its log-determinant, and the backward pass."""
     from sb3_tdc.meow.flow import ConditionalFlow, Swish
 
     features, actions = th.randn(BATCH, features_dim), 2 * th.rand(BATCH, action_dim) - 1

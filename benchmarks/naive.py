@@ -1,4 +1,4 @@
-"""TDC-λ as one would first write it: separate networks, autograd through all pairs. For comparison of speed alone."""
+"""A naive implementation of TDC-λ, only to compare speed: separate networks, autograd through all quantile pairs."""
 
 from typing import Any
 
@@ -24,14 +24,14 @@ class NaiveCritic(ContinuousCritic):
 
 
 class NaivePolicy(TD3Policy):
-    """TD3's policy with these critics."""
+    """TD3's policy with the critics of :class:`NaiveCritic`."""
 
     def make_critic(self, features_extractor: Any = None) -> NaiveCritic:
         return NaiveCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
 
 class NaiveTDC(TD3):
-    """The deterministic head; the loop is that of SB3's TD3, the losses are the paper's."""
+    """TDC with the deterministic head: the training loop of SB3's TD3 with the losses of the paper."""
 
     lam, kappa = 1.0, 1.0
 

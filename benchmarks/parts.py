@@ -1,7 +1,7 @@
 """
-``python -m benchmarks.parts``: where the time of a training step goes, part by part, while training.
+``python -m benchmarks.parts``: the time of each part of a training step, measured during training.
 
-Each part is timed where it happens, after the parts before it have emptied the caches; in a loop of its own it would
+Each part is timed in place, after the parts before it have replaced its data in the caches; in a separate loop it would
 be several times faster.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.speed import ENVS, hardware
 
-PARTS = {  # name → its place in the model, the method
+PARTS = {  # name → the object within the model, its method
     "draw a minibatch": ("_fused_update", "sample"),
     "compare what the update relies on": ("_fused_update", "fits"),
     "target actions: a forward pass of the target actor": ("_fused_update", "_set_target_actions"),

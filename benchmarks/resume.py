@@ -1,9 +1,9 @@
 """
-What states cost: how long training waits for them, and what they write.
+The cost of resume states: how long training waits for them, and how much they write.
 
-``python -m benchmarks.resume`` trains TDC with the paper's hyperparameters for a few thousand steps, for the time
-of a step, then continues without updates until states have been written (their pause is the same), prints a table
-and writes it to ``docs/benchmarks/resume.md``.
+``python -m benchmarks.resume`` trains TDC with the paper's hyperparameters for a few thousand steps, to measure the
+time of a step. It then continues without updates, which do not change the pauses, until enough states have been
+written. It prints a table and writes it to ``docs/benchmarks/resume.md``.
 """
 
 import argparse
@@ -27,7 +27,7 @@ WARM_UP, TIMED = 300, 2_000
 
 
 class Clock(BaseCallback):
-    """The seconds of a training step, and those that training has waited for every state."""
+    """A callback that measures the seconds of a training step, and those that training waits for each state."""
 
     is_captured = False
 
@@ -38,7 +38,7 @@ class Clock(BaseCallback):
         self.pauses: list[float] = []
         self.step, self.seconds = 0, 0.0
 
-    def _on_rollout_start(self) -> None:  # after the states
+    def _on_rollout_start(self) -> None:  # called after the state is written
         if self.num_timesteps == 2 * WARM_UP:
             self.start = time.perf_counter()
         elif self.num_timesteps == 2 * WARM_UP + TIMED:
@@ -53,14 +53,12 @@ class Clock(BaseCallback):
 
 
 def disk_usage(folder: Path) -> int:
-    """:return: bytes of all files below a folder, of linked ones once"""
+    """Return the bytes of all files below a folder; files with several hard links count once."""
     return sum({(s.st_ino): s.st_size for s in (p.stat() for p in folder.rglob("*") if p.is_file())}.values())
 
 
 def measure(env_id: str, n_states: int, freq: int, folder: Path) -> dict[str, float]:
-    """
-    :return: seconds and megabytes by name
-    """
+    """Return the measured seconds, megabytes and shares by name."""
     entry, _ = read_entry(hyperparams_file("tdc"), env_id)
     model = TDC(env=gym.make(env_id), seed=1, device="cpu", **{**_model_arguments(entry), "learning_starts": WARM_UP})
     states = ResumeCallback(folder / "resume", freq, verbose=0)
@@ -91,7 +89,7 @@ def _model_arguments(entry: dict) -> dict:
 
 
 def report(results: dict[str, dict[str, float]], command: str) -> str:
-    """:return: Markdown"""
+    """Return the report in Markdown."""
     names = next(iter(results.values()))
     lines = ["# What states cost", "", f"`{command}`", ""]
     lines += [f"| | {' | '.join(results)} |", f"|---|{'---|' * len(results)}"]

@@ -1,8 +1,8 @@
 """
-``python -m benchmarks.speed``: whole environment steps of TDC and its peers, side by side.
+``python -m benchmarks.speed``: the time of whole environment steps of TDC, compared with its peers.
 
-Every row is a ratio of times measured in one process, in turn, half a second each: the machine may drift, the
-ratio does not follow. Peers: ``pip install "sb3-tdc[bench]"``; one that is missing is left out, and said so.
+Every row is a ratio of times measured in one process, in turns of half a second, so that a drift of the machine's speed
+does not change the ratio. Peers: ``pip install "sb3-tdc[bench]"``; one that is missing is left out, with a message.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from unittest import mock
 import numpy as np
 
 ENVS = ("HalfCheetah-v4", "Hopper-v4", "Humanoid-v4")
-# What is asked of TDC, as time of the peer / time of TDC, on HalfCheetah-v4: (peer, threads) → at least
+# Targets on HalfCheetah-v4: (peer, threads) → smallest ratio of the peer's time to TDC's
 TARGETS = {
     ("SB3 TD3", 2): 1.6,
     ("SB3 TD3", 1): 1.4,
@@ -36,7 +36,7 @@ WITHOUT_NUMBA = "TDC, without Numba"
 
 
 def make_models(env_id: str) -> dict[str, Any]:
-    """:return: a model for every peer that is installed, by name; ``TDC`` is the one the others are compared with"""
+    """Return a model for every installed peer, by name; the others are compared with ``TDC``."""
     import gymnasium as gym
     from stable_baselines3 import SAC, TD3
     from stable_baselines3.common.noise import NormalActionNoise
@@ -82,7 +82,7 @@ def _optional(name: str) -> Any:
 
 
 def matrix_products(model: Any) -> Callable[[], None]:
-    """:return: a function that computes the matrix products of one gradient step, and nothing else"""
+    """Return a function that computes only the matrix products of one gradient step."""
     fused = model._fused_update
     calls = 0
 
@@ -112,7 +112,7 @@ def matrix_products(model: Any) -> Callable[[], None]:
 
 
 class Load:
-    """Processor time that other processes take meanwhile, in cores (Linux)."""
+    """A context that measures the processor time of other processes meanwhile, in cores (Linux)."""
 
     def __enter__(self) -> "Load":
         self.start = time.perf_counter(), self._busy(), sum(os.times()[:4])
@@ -133,9 +133,11 @@ class Load:
 
 def time_calls(functions: dict[str, Callable[[int], Any]], rounds: int, seconds: float) -> dict[str, list[float]]:
     """
-    :param functions: by name; each takes how often it is to do what is measured
-    :param seconds: a turn, about
-    :return: milliseconds per call, (rounds,) for every function; in every round one after the other, in another order
+    Time functions in turn, in a new random order in every round.
+
+    :param functions: by name; each takes the number of calls to make
+    :param seconds: approximate length of a turn
+    :return: milliseconds per call, (rounds,) for every function
     """
     times: dict[str, list[float]] = {name: [] for name in functions}
     shuffle = random.Random(0)
@@ -147,14 +149,14 @@ def time_calls(functions: dict[str, Callable[[int], Any]], rounds: int, seconds:
 
     for _ in range(rounds):
         for name in shuffle.sample(list(functions), len(functions)):
-            # Whoever ran before has left its data in the caches and its threads awake: the first calls are not counted
+            # The function before has left its data in the caches and its threads awake: the first calls do not count
             estimate = time_call(functions[name], WARM_UP)
             times[name].append(1000 * time_call(functions[name], max(WARM_UP, round(seconds / estimate))))
     return times
 
 
 def repeat(function: Callable[[], Any]) -> Callable[[int], None]:
-    """:return: what calls it a number of times"""
+    """Return a function that takes n, and calls the given function n times."""
 
     def run(n: int) -> None:
         for _ in range(n):
@@ -164,7 +166,7 @@ def repeat(function: Callable[[], Any]) -> Callable[[int], None]:
 
 
 def gradient_steps(model: Any, batch_size: int) -> dict[str, Callable[[int], None]]:
-    """Return functions for :func:`time_calls`: the gradient steps of a model, and the matrix products of one."""
+    """Return two functions for :func:`time_calls`: gradient steps of a model, and their matrix products alone."""
     return {
         "TDC": repeat(lambda: model.train(1, batch_size)),
         "matrix products": repeat(matrix_products(model)),
@@ -184,7 +186,7 @@ def learn_steps(name: str, model: Any) -> Callable[[int], None]:
 
 
 def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
-    """Whole environment steps of every peer, then gradient steps of TDC next to its matrix products."""
+    """Time whole environment steps of every peer, then gradient steps of TDC and their matrix products."""
     models = make_models(env_id)
     learn = {name: learn_steps(name, model) for name, model in models.items()}
     for function in learn.values():
@@ -201,7 +203,7 @@ def measure_env(env_id: str, rounds: int, seconds: float) -> dict[str, Any]:
 
 
 def measure_scaling(rounds: int) -> dict[str, Any]:
-    """Gradient steps of TDC next to the matrix products, against quantiles, batch and width."""
+    """Time gradient steps of TDC and their matrix products, against quantiles, batch size and width."""
     from sb3_tdc import TDC
 
     def measure(n_quantiles: int = 64, batch_size: int = 256, width: int = 256) -> dict[str, list[float]]:
@@ -228,7 +230,7 @@ def measure_scaling(rounds: int) -> dict[str, Any]:
 
 
 def run_child(task: str, threads: int, arguments: argparse.Namespace) -> dict[str, Any]:
-    """A process of its own for every measurement, on as many cores as threads."""
+    """Run one measurement in a separate process, on as many cores as threads."""
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {**os.environ, **dict.fromkeys(names, str(threads)), "JAX_PLATFORMS": "cpu", "TQDM_DISABLE": "1"}
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.speed", "--task", task, "--threads", str(threads)]
@@ -238,7 +240,7 @@ def run_child(task: str, threads: int, arguments: argparse.Namespace) -> dict[st
 
 
 def run_together(runs: int, threads: int, seconds: float) -> float:
-    """:return: environment steps per second of some runs of TDC at once, all together, on all cores"""
+    """Return the total environment steps per second of several simultaneous runs of TDC, on all cores."""
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
     environment = {**os.environ, **dict.fromkeys(names, str(threads))}
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.speed", "--task", "rate", "--threads", str(threads)]
@@ -246,7 +248,7 @@ def run_together(runs: int, threads: int, seconds: float) -> float:
         subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         for _ in range(runs)
     ]
-    for child in children:  # each says when it is warm, then waits for the length of the measurement
+    for child in children:  # each reports the end of its warm-up, then waits for the length of the measurement
         assert child.stdout is not None
         child.stdout.readline()
     for child in children:
@@ -257,7 +259,7 @@ def run_together(runs: int, threads: int, seconds: float) -> float:
 
 
 def measure_rate() -> None:
-    """The child of :func:`run_together`."""
+    """Measure the rate of one run, in a child of :func:`run_together`."""
     from sb3_tdc import TDC
 
     model = TDC("MlpPolicy", ENVS[0], learning_starts=300, buffer_size=50_000, device="cpu", seed=0).learn(340)
@@ -271,7 +273,7 @@ def measure_rate() -> None:
 
 
 def measure_threads(rounds: int, seconds: float = 6.0) -> list[dict[str, Any]]:
-    """One run alone and as many as cores, with one thread each and with as many as cores."""
+    """Measure one run and as many runs as cores, with one thread each and with as many threads as cores."""
     cores = os.cpu_count() or 1
     settings = [(runs, threads) for runs in (1, cores) for threads in (1, cores)]
     rates: dict[tuple[int, int], list[float]] = {setting: [] for setting in settings}
@@ -282,7 +284,7 @@ def measure_threads(rounds: int, seconds: float = 6.0) -> list[dict[str, Any]]:
 
 
 def work(arguments: argparse.Namespace) -> None:
-    """What a child does: pin itself, measure, print JSON."""
+    """Do the work of a child process: pin it to cores, measure, print JSON."""
     if arguments.task == "rate":
         measure_rate()
         return

@@ -1,4 +1,4 @@
-"""Results of ``benchmarks.speed`` → a table (Markdown), a plot, and the numbers themselves (JSON)."""
+"""The report of ``benchmarks.speed``: tables (Markdown), a plot, and the numbers themselves (JSON)."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ _OTHER_PAIRS = ("SB3 TD3 / TDC, readable update", "SB3 SAC / TDC, stochastic hea
 
 
 def ratios(times: list[float], reference: list[float]) -> np.ndarray:
-    """:return: (rounds,), time over the reference's time of the same round"""
+    """Return (rounds,), each time divided by the reference's time of the same round."""
     return np.asarray(times) / np.asarray(reference)
 
 
@@ -23,7 +23,7 @@ def quartiles(values: np.ndarray) -> str:
 
 
 def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float]) -> list[str]:
-    """Rows of peers, columns of threads: time of a peer over the time of TDC."""
+    """Return a table of the time of each peer (rows) over that of TDC, by number of threads (columns)."""
     threads = list(results)
     header = [
         "peer",
@@ -51,7 +51,7 @@ def table_of_env(results: dict[str, Any], targets: dict[tuple[str, int], float])
 
 
 def table_of_runs(together: list[dict[str, Any]]) -> list[str]:
-    """Steps per second of all runs together, against runs and threads."""
+    """Return a table of the steps per second of all runs together, by number of runs and threads."""
     lines = ["| runs at once | threads each | steps/s of all together (each turn) |", "|---|---|---|"]
     for row in together:
         turns = ", ".join(f"{rate:.0f}" for rate in row["rates"])
@@ -60,7 +60,7 @@ def table_of_runs(together: list[dict[str, Any]]) -> list[str]:
 
 
 def draw_scaling(scaling: dict[str, Any], path: Path) -> None:
-    """Milliseconds of a gradient step and of its matrix products, against quantiles, batch size and width."""
+    """Draw the milliseconds of a gradient step and of its matrix products, against quantiles, batch size and width."""
     from matplotlib.figure import Figure
 
     kinds = [kind for kind in next(iter(scaling.values())) if kind != "foreign_load"]

@@ -28,10 +28,10 @@ _STARTED_BY_OTHERS = ("job",)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Run a command; Ctrl-C, a closed pipe and a file that cannot be read or written end it without a traceback.
+    Run a command. Ctrl-C, a closed pipe, and a file that cannot be read or written end it without a traceback.
 
-    :param argv: its name and its arguments, those of the process by default
-    :return: its exit status
+    :param argv: name and arguments of the command; by default, those of the process
+    :return: the exit status of the command
     """
     name, *arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     try:
@@ -39,10 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(name, arguments)
         finally:
             if sys.stdout is not None:
-                sys.stdout.flush()  # here a closed pipe can still be answered
+                sys.stdout.flush()  # a closed pipe can still be handled here
     except KeyboardInterrupt:
         status, sentence = 130, "Stopped."
-    except BrokenPipeError:  # whoever reads has seen enough: sb3-tdc enjoy ... | head -1
+    except BrokenPipeError:  # the reader has seen enough: sb3-tdc enjoy ... | head -1
         status, sentence = 128 + 13, ""  # as if SIGPIPE had ended it
     except OSError as error:
         reason = error.strerror or " ".join(str(error).split())
@@ -68,7 +68,7 @@ def _run(name: str, arguments: Sequence[str]) -> int:
         return 2
     try:
         module = importlib.import_module(f"sb3_tdc.cli.{name}")
-    except ImportError as error:  # with the command that installs what is missing
+    except ImportError as error:  # its message has the command that installs the missing package
         print(f"{command(name)}: error: {error}", file=sys.stderr)
         return 2
     return module.main(arguments)

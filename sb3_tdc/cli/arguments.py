@@ -1,4 +1,4 @@
-"""Parsing that the commands share."""
+"""Argument parsing that the commands share."""
 
 import argparse
 import sys
@@ -12,12 +12,12 @@ from sb3_tdc.common.checks import suggest, unknown
 from sb3_tdc.common.commands import command
 from sb3_tdc.runs.settings import Group, RunSettings, default_of, flags_of
 
-# What flags are added to: a parser, or a group of its help
+# Flags are added to a parser, or to an argument group of it
 _Container = argparse._ActionsContainer
 
 
 class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
-    """Show defaults that are values and that the help does not name: a flag that is not given has none to show."""
+    """A formatter that shows a default unless it is None, a bool or empty, or the help names it already."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         says_nothing = action.default is None or isinstance(action.default, bool) or action.default in ([], {}, "")
@@ -27,10 +27,10 @@ class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter):
 
 class Parser(argparse.ArgumentParser):
     """
-    An argument parser that names the nearest flag for a misspelt one.
+    An argument parser that suggests the nearest flag for a misspelt one.
 
-    :param name: of the command, or "" for none
-    :param zoo_flags: flags of RL Zoo that have another form here, and which
+    :param name: name of the command, or "" for none
+    :param zoo_flags: flags of RL Zoo that do not exist here, each with the alternative
     """
 
     def __init__(self, name: str, description: str = "", zoo_flags: Mapping[str, str] | None = None):
@@ -50,23 +50,23 @@ class Parser(argparse.ArgumentParser):
         return parsed
 
     def parse_given(self, args: Sequence[str] | None = None) -> dict[str, Any]:
-        """Return the arguments that are on the command line, without the defaults of the others."""
+        """Return only the arguments that are on the command line, without defaults."""
         absent = object()
         names = {action.dest for action in self._actions}
         parsed = self.parse_args(args, argparse.Namespace(**dict.fromkeys(names, absent)))
         return {name: value for name, value in vars(parsed).items() if value is not absent}
 
     def error(self, message: str) -> NoReturn:
-        """Print one sentence and leave with status 2, without the usage, which fills a screen."""
+        """Print one sentence and exit with status 2, without the usage text, which would fill a screen."""
         self.exit(2, f"{self.prog}: error: {message}\n")
 
     def fail(self, error: Exception) -> NoReturn:
-        """Leave as for a bad argument."""
+        """Exit with the message of an exception, as for a bad argument."""
         self.error(str(error))
 
 
 class KeyValues(argparse.Action):
-    """``key:value key:value`` → a dict; the values are YAML, never evaluated. A second flag adds to the first."""
+    """``key:value key:value`` → a dict. Values are read as YAML, never evaluated. A repeated flag adds to the first."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
@@ -84,7 +84,7 @@ class KeyValues(argparse.Action):
 
 
 class Names(argparse.Action):
-    """``name name`` → a list. A second flag adds to the first."""
+    """``name name`` → a list. A repeated flag adds to the first."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
@@ -98,7 +98,7 @@ def _given_before(namespace: argparse.Namespace, action: argparse.Action, kind: 
 
 
 def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
-    """Return an argument type that takes one of the known names, and else names the nearest."""
+    """Return an argument type that accepts the known names, and suggests the nearest one for any other."""
 
     def check(name: str) -> str:
         if name not in known:
@@ -109,22 +109,22 @@ def one_of(kind: str, known: Iterable[str]) -> Callable[[str], str]:
 
 
 def add_trust(parser: _Container) -> None:
-    """Add ``--trust``, of commands that load saved models."""
+    """Add ``--trust``, for commands that load saved models."""
     help = "let the files run code, as SB3 does: only if you know their origin"
     parser.add_argument("--trust", action="store_true", help=help)
 
 
 def warn_about_trust(is_given: bool) -> None:
-    """Say what ``--trust`` means, if it is given."""
+    """Print a warning about ``--trust``, if it is given."""
     if is_given:
         print("--trust: whatever code these files hold runs with your rights", file=sys.stderr)
 
 
 def add_settings(parser: _Container, names: Iterable[str]) -> None:
     """
-    Add some of the flags of :class:`~sb3_tdc.runs.settings.RunSettings`.
+    Add the flags of some settings of :class:`~sb3_tdc.runs.settings.RunSettings`.
 
-    :param names: of the settings
+    :param names: names of the settings
     """
     names = set(names)
     for declared in fields(RunSettings):
@@ -133,7 +133,7 @@ def add_settings(parser: _Container, names: Iterable[str]) -> None:
 
 
 def add_all_settings(parser: Parser) -> None:
-    """Add the flags of :class:`~sb3_tdc.runs.settings.RunSettings`, in groups."""
+    """Add the flags of all settings of :class:`~sb3_tdc.runs.settings.RunSettings`, in groups."""
     groups = {group: parser.add_argument_group(group.value) for group in Group}
     for declared in fields(RunSettings):
         _add_setting(groups[declared.metadata["group"]], declared)

@@ -30,7 +30,7 @@ from sb3_tdc.runs.settings import MAX_SEED, RunSettings, check_settings
 from sb3_tdc.runs.trained import TrainedModel, find_model, open_run, open_zip
 from sb3_tdc.tdc import TDC
 
-# What users of RL Zoo type by habit
+# Flags that users of RL Zoo type by habit, with what to know about them here
 _ZOO_FLAGS = {
     "--deterministic": "the mean action is the default here; --stochastic samples",
     "--n-envs": "one environment is played; --n-episodes says how often",
@@ -47,7 +47,7 @@ _CHOICES = ("load_best", "load_checkpoint", "load_last_checkpoint")
 
 
 def make_parser() -> Parser:
-    """Return RL Zoo's flags, and the folder of a run instead of ``--algo``, ``--env`` and ``--exp-id``."""
+    """Return a parser of RL Zoo's flags; a run folder may replace ``--algo``, ``--env`` and ``--exp-id``."""
     parser = Parser(
         "enjoy",
         "Watch a trained agent: in a window where there is a display, with --record where there is none.",
@@ -101,10 +101,10 @@ def make_parser() -> Parser:
 
 def find_trained(args: argparse.Namespace, given: Collection[str]) -> TrainedModel:
     """
-    Return the model that the arguments name; for a zip outside a run, the algorithm and the environment are theirs.
+    Return the model that the arguments name. For a zip outside a run, they also name its algorithm and environment.
 
-    :param given: names of the arguments that are not defaults
-    :raises ValueError: if there is none, or the arguments contradict each other
+    :param given: names of the arguments that are on the command line
+    :raises ValueError: if there is no such model, or the arguments contradict each other
     """
     if args.run is None:
         return _open_run(args)
@@ -129,7 +129,7 @@ def _open_run(args: argparse.Namespace) -> TrainedModel:
 
 def _open_file(args: argparse.Namespace, given: Collection[str]) -> TrainedModel:
     try:
-        run = RunFolder.open(args.run.parent)  # it tells what its models were trained with
+        run = RunFolder.open(args.run.parent)  # the run folder knows the algorithm and the environment
     except ValueError:
         if "env" not in given:
             raise ValueError(
@@ -141,7 +141,7 @@ def _open_file(args: argparse.Namespace, given: Collection[str]) -> TrainedModel
 
 
 def _play(model: BaseAlgorithm, env: VecEnv, args: argparse.Namespace) -> list[float]:
-    """Play episodes, print each, and return their returns."""
+    """Play episodes, print the return of each, and return them."""
     returns: list[float] = []
     try:
         steps = None if args.n_timesteps == -1 else args.n_timesteps
@@ -160,7 +160,7 @@ def _check_explainable(args: argparse.Namespace, trained: TrainedModel) -> None:
     """
     Check the arguments of ``--explain``.
 
-    :raises ValueError: if there is nothing to explain, or an argument has no meaning with ``--explain``
+    :raises ValueError: if the critics predict no distribution, or another argument has no meaning with ``--explain``
     """
     if not issubclass(KNOWN_ALGORITHMS[trained.algo], TDC):
         known = " or ".join(name for name, algorithm in KNOWN_ALGORITHMS.items() if issubclass(algorithm, TDC))
@@ -174,9 +174,9 @@ def _check_explainable(args: argparse.Namespace, trained: TrainedModel) -> None:
 
 def _check_outputs(args: argparse.Namespace, trained: TrainedModel) -> None:
     """
-    Check that every output can be written.
+    Check that every output file can be written, before anything is played.
 
-    :raises ValueError: if an output cannot be written, before anything is played
+    :raises ValueError: if a file cannot be written
     """
     if args.explain:
         check_writable("--explain:", Path(f"{explanation_path(trained)}.png"))
@@ -188,10 +188,10 @@ def _check_outputs(args: argparse.Namespace, trained: TrainedModel) -> None:
 
 def _choose_who_acts(model: BaseAlgorithm, args: argparse.Namespace) -> AbstractContextManager[None]:
     """
-    Let an advisory board act as in ``predict``, or the actor alone.
+    Choose whether the advisory board of a model takes part, as in ``predict``, or the actor acts alone.
 
-    :return: a context in which the actor acts alone, with ``--actor-alone`` and with ``--explain``
-    :raises ValueError: if there is no board to leave out
+    :return: a context in which the actor acts alone, if ``--actor-alone`` or ``--explain`` is given
+    :raises ValueError: if ``--actor-alone`` is given for a model without a board
     """
     if isinstance(model.policy, AdvisedPolicy):
         return model.policy.actor_alone() if args.actor_alone or args.explain else nullcontext()
@@ -202,9 +202,9 @@ def _choose_who_acts(model: BaseAlgorithm, args: argparse.Namespace) -> Abstract
 
 def _check_arguments(args: argparse.Namespace) -> None:
     """
-    Check numbers and the device.
+    Check the numbers and the device among the arguments.
 
-    :raises ValueError: for a number that is not allowed, or a device that is not there
+    :raises ValueError: if a number is not allowed, or there is no such device
     """
     check_settings(RunSettings(num_threads=args.num_threads, device=args.device))
     if not 0 <= args.seed <= MAX_SEED:
@@ -242,7 +242,7 @@ def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
             follow_agent(unwrapped)
         model = trained.load(env, args.device)
         stack.enter_context(_choose_who_acts(model, args))
-        env.seed(args.seed)  # loading has seeded it as for training
+        env.seed(args.seed)  # loading the model has seeded it as for training
         print(f"{trained.path}: {trained.algo} on {trained.env_id}, trained for {count(model.num_timesteps, 'step')}")
         if args.explain:
             assert isinstance(model, TDC)
@@ -259,7 +259,7 @@ def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
 
 
 def _filmed(env: VecEnv, args: argparse.Namespace, stack: ExitStack) -> VecEnv:
-    """Return an environment that writes the video of ``--record``, if it is given."""
+    """Wrap an environment so that it writes the video of ``--record``, if that is given."""
     if args.record is None:
         return env
     fps = env.metadata.get("render_fps", 30)
@@ -271,7 +271,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Watch, record or explain a trained agent.
 
-    :param argv: arguments, those of the process by default
+    :param argv: arguments; by default, those of the process
     :return: 0, or 1 if the environment failed
     """
     parser = make_parser()

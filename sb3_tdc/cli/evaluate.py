@@ -14,7 +14,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Play test episodes with every finished run.
 
-    :param argv: arguments, those of the process by default
+    :param argv: arguments; by default, those of the process
     :return: 0, or 1 if a run could not be tested
     """
     parser = Parser("evaluate", "Play test episodes with every finished run; what has been played is not played again.")

@@ -1,4 +1,4 @@
-"""``sb3-tdc inspect FILE``: what a saved file holds, what of it is code, and whether it would be opened."""
+"""``sb3-tdc inspect FILE``: show the content of a saved file, the code in it, and whether it would be opened."""
 
 import json
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ _KINDS = "zip of a model, a pickle of VecNormalize statistics or of a replay buf
 
 def inspect_run(path: Path) -> tuple[list[str], bool]:
     """
-    Describe the folder of a run, with its last and its best model.
+    Describe a run folder, with its final and its best model.
 
-    :return: lines for the screen, and whether all of it would be opened
-    :raises ValueError: if it is not the folder of a run
+    :return: lines for the screen, and whether every file would be opened
+    :raises ValueError: if it is not a run folder
     """
     run = RunFolder.open(path)
     lines, is_good = [f"{escaped(str(path))}: the folder of a run"], True
@@ -40,10 +40,10 @@ def inspect_run(path: Path) -> tuple[list[str], bool]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Show what a saved file holds.
+    Show the content of a saved file.
 
-    :param argv: arguments, those of the process by default
-    :return: 0 if all would be opened, 1 if something is refused, 2 if it is no such file
+    :param argv: arguments; by default, those of the process
+    :return: 0 if every file would be opened, 1 if one would be refused; other files and bad arguments exit with 2
     """
     parser = Parser("inspect", "Show what a saved file holds, what of it is code, and whether it would be opened.")
     parser.add_argument("path", type=Path, help=f"a {_KINDS}, or a run folder")

@@ -1,4 +1,4 @@
-"""``sb3-tdc matrix SUITE``: train the runs of a suite, several at once; the same command continues."""
+"""``sb3-tdc matrix SUITE``: train the runs of a suite, several at once; the same command resumes stopped ones."""
 
 import argparse
 import sys
@@ -45,7 +45,7 @@ def _plan(args: argparse.Namespace) -> Plan:
     """
     Make the plan that the arguments describe.
 
-    :raises ValueError: for anything that is not allowed
+    :raises ValueError: if an argument is not allowed
     """
     if not 0 < args.scale <= 1:
         raise ValueError(f"--scale must be above 0 and at most 1, got {args.scale:g}")
@@ -59,7 +59,7 @@ def _plan(args: argparse.Namespace) -> Plan:
 
 
 def _without_published(plan: Plan, args: argparse.Namespace) -> Plan:
-    """Return the jobs that have no published results."""
+    """Return the plan without the jobs that have published results."""
 
     def is_published(job: Job) -> bool:
         return replace(job, logs=args.results / job.logs.relative_to(args.logs.resolve())).is_finished
@@ -85,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Train the runs of a suite.
 
-    :param argv: arguments, those of the process by default
-    :return: 0 if all that can be run is finished, 1 if something failed, 130 if the user stopped it
+    :param argv: arguments; by default, those of the process
+    :return: 0 if all runs that can be trained are finished, 1 if one failed, 130 if the user stopped the command
     """
     parser = make_parser()
     args = parser.parse_args(argv)

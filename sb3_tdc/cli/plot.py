@@ -24,7 +24,7 @@ class Evaluated:
     """
     The evaluations of one run.
 
-    :param label: algorithm and seed, and the folder where several have these in common
+    :param label: algorithm and seed, and the folder if several runs share them
     :param timesteps: (evaluations,)
     :param returns: (evaluations, episodes)
     """
@@ -39,7 +39,7 @@ def load_curve(run: RunFolder, until: int | None = None) -> Evaluated:
     """
     Read the evaluations of a run.
 
-    :param until: leave out those after this step
+    :param until: leave out evaluations after this step
     :raises ValueError: if the run has no evaluations, or they cannot be read
     """
     path, args, evaluations = run.evaluations, run.args, read_evaluations(run)
@@ -54,9 +54,9 @@ def load_curve(run: RunFolder, until: int | None = None) -> Evaluated:
 
 def load_curves(runs: Sequence[Path], until: int | None = None) -> list[Evaluated]:
     """
-    Read the evaluations of runs; those of one label have their folders too, as far as these differ.
+    Read the evaluations of runs. Runs with the same label get the differing part of their folders added to it.
 
-    :raises ValueError: as :func:`load_curve`, or if a folder is not one of a run
+    :raises ValueError: as :func:`load_curve`, or if a folder is not a run folder
     """
     curves = [load_curve(RunFolder.open(run), until) for run in runs]
     times = Counter(curve.label for curve in curves)
@@ -70,10 +70,10 @@ def load_curves(runs: Sequence[Path], until: int | None = None) -> list[Evaluate
 
 def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
     """
-    Draw one line for each run, the mean over the episodes of each evaluation; the episodes are the dots.
+    Draw one line for each run, the mean over the episodes of each evaluation, and a dot for each episode.
 
-    :param axes: of matplotlib
-    :param curves: of one environment
+    :param axes: axes of matplotlib
+    :param curves: evaluations of runs on one environment
     """
     for curve in curves:
         marker = "o" if len(curve.timesteps) == 1 else None  # a line needs two points
@@ -87,7 +87,7 @@ def draw_curves(axes: Any, curves: Sequence[Evaluated]) -> None:
 
 
 def figure_size(n_curves: int) -> tuple[float, float]:
-    """Return width and height in inches, with the rows of a legend below the axes."""
+    """Return width and height in inches, with space for the legend below the axes."""
     return 7.0, 4.0 + _LEGEND_ROW * n_curves
 
 
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Draw the learning curves of runs.
 
-    :param argv: arguments, those of the process by default
+    :param argv: arguments; by default, those of the process
     :return: 0
     """
     parser = Parser("plot", "Draw the learning curves of runs.")

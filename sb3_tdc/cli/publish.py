@@ -17,9 +17,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Copy the small files of finished runs.
 
-    :param argv: arguments, those of the process by default
-    :return: 0, or 1 if there is nothing to publish, a finished run has not played its test episodes, or another run is
-        in its place
+    :param argv: arguments; by default, those of the process
+    :return: 0, or 1 if there is nothing to publish, a published run has no test episodes yet, or a run is refused
+        because another one is in its place
     """
     parser = Parser(
         "publish", "Copy the small files of all finished runs: evaluations, settings, versions, test returns, the log."

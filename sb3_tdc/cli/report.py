@@ -13,7 +13,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Make the report on folders of runs.
 
-    :param argv: arguments, those of the process by default
+    :param argv: arguments; by default, those of the process
     :return: 0
     """
     parser = Parser("report", "Make one HTML page of all runs in some folders, with figures and tables next to it.")

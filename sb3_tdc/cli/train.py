@@ -1,4 +1,4 @@
-"""``sb3-tdc train --algo tdc --env Walker2d-v4``: arguments and messages; the run itself is in ``runs/training.py``."""
+"""``sb3-tdc train --algo tdc --env Walker2d-v4``: arguments and messages; ``runs/training.py`` has the training."""
 
 import sys
 import time
@@ -19,7 +19,7 @@ from sb3_tdc.runs.training import NotSavedError, SetupError, TrainingError, Trai
 
 _TUNE = "to search hyperparameters: sb3-tdc tune (--search, --samples, --seeds, --jobs)"
 _TRACK = "a run writes TensorBoard files into its folder; `wandb sync` uploads them"
-# What users of RL Zoo type by habit
+# Flags that users of RL Zoo type by habit, with their replacements here
 _ZOO_FLAGS = {
     **dict.fromkeys(
         (
@@ -63,8 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Train, or resume a run.
 
-    :param argv: arguments, those of the process by default
-    :return: 0, 1 if training diverged or its model could not be saved, 130 if the user stopped it
+    :param argv: arguments; by default, those of the process
+    :return: 0, 1 if training failed or the model could not be saved, 130 if the user stopped it
     """
     with harmless_output(), warnings_as_sentences():
         return _main(argv)
@@ -144,7 +144,7 @@ def _print_how_to_continue(argv: Sequence[str] | None, run: TrainingRun, outcome
 
 
 def _command_to_continue(argv: Sequence[str] | None, run: TrainingRun, n_timesteps: int) -> str:
-    """Return this command with another number of steps, and a model to start from."""
+    """Return this command with a new number of steps, and the saved model to start from."""
     without = Parser("")
     without.add_argument("-n", "--n-timesteps")
     without.add_argument("-i", "--trained-agent")

@@ -1,4 +1,4 @@
-"""``sb3-tdc tune --algo tdc --env Hopper-v4``: search λ, or other hyperparameters, on Ray Tune."""
+"""``sb3-tdc tune --algo tdc --env Hopper-v4``: search λ or other hyperparameters with Ray Tune."""
 
 import argparse
 import sys
@@ -68,9 +68,9 @@ def make_parser() -> Parser:
 
 def _read_arguments(args: argparse.Namespace, given: dict[str, Any]) -> None:
     """
-    Take the arguments of the search that is resumed.
+    Replace the arguments with those of the search that is resumed.
 
-    :raises ValueError: if there is none, its file is damaged, or the command line contradicts it
+    :raises ValueError: if there is no such search, its file is damaged, or the command line contradicts it
     """
     stored = _read_stored(args.resume / _ARGUMENTS)
     for name, value in given.items():
@@ -84,9 +84,9 @@ def _read_arguments(args: argparse.Namespace, given: dict[str, Any]) -> None:
 
 def _read_stored(path: Path) -> dict[str, Any]:
     """
-    Read the arguments of a search, without those that belong to a process.
+    Read the stored arguments of a search; those of a single process (``--jobs``, ``--address``) are not part of it.
 
-    :raises ValueError: if one is missing, or is none that the command line would have given
+    :raises ValueError: if an argument is missing, or has a value that the command line would not produce
     """
     if not path.is_file():
         raise ValueError(f"{path.parent} is not the folder of a search: it has no {path.name}")
@@ -109,7 +109,7 @@ def _read_stored(path: Path) -> dict[str, Any]:
 
 
 def _make_folder(args: argparse.Namespace) -> Path:
-    """Return the next free folder of a search; it does not exist yet."""
+    """Return the folder for a new search, with the next free number; it is not made yet."""
     parent = args.logs.resolve() / "search" / args.algo
     name = folder_name(args.env)
     folder = parent / f"{name}_{max(numbered(parent, name), default=0) + 1}"
@@ -121,7 +121,7 @@ def _lock(folder: Path) -> Any:
     """
     Keep other processes out of a search.
 
-    :return: to be held as long as the search lasts
+    :return: the locked file, which must stay open as long as the search lasts
     :raises ValueError: if another process runs the search
     """
     locked = lock(folder / _ARGUMENTS)
@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Search hyperparameters.
 
-    :param argv: arguments, those of the process by default
+    :param argv: arguments; by default, those of the process
     :return: 0, 1 if a trial failed, 130 if the user stopped the search
     """
     parser = make_parser()
@@ -148,10 +148,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _search(args: argparse.Namespace, given: dict[str, Any]) -> int:
     """
-    Check the arguments, take the folder of the search, and run it.
+    Check the arguments, make and lock the folder of the search, and run it.
 
     :return: the exit status
-    :raises ValueError: for anything that is not allowed, before anything is made
+    :raises ValueError: if an argument is not allowed, before any file is written
     """
     if args.resume is not None:
         _read_arguments(args, given)
@@ -174,7 +174,7 @@ def _search(args: argparse.Namespace, given: dict[str, Any]) -> int:
 
 def _run(args: argparse.Namespace, candidates: Sequence[Sequence[Job]]) -> int:
     """
-    Train the candidates, and rank them if all have come to their end.
+    Train the candidates, and rank them if all trials have ended.
 
     :return: the exit status
     """

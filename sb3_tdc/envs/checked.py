@@ -1,4 +1,4 @@
-"""Environments that fail: whatever they raise, return or die of becomes one sentence, also from another process."""
+"""Checks of environments: an exception, an invalid return value or a dead process becomes an error of one sentence."""
 
 import inspect
 import signal
@@ -26,8 +26,8 @@ class EnvironmentFaultError(RuntimeError):
     """
     An environment broke gymnasium's rules, raised an exception, or lost its process.
 
-    :param sentence: what it did
-    :param details: its traceback
+    :param sentence: what the environment did
+    :param details: the traceback, if there is one
     """
 
     def __init__(self, sentence: str, details: str = ""):
@@ -36,7 +36,7 @@ class EnvironmentFaultError(RuntimeError):
 
 
 def describe_exception(error: BaseException) -> str:
-    """Return type, message and place of an exception, in one line."""
+    """Return the type, the message and the place of an exception, in one line."""
     message = " ".join(str(error).split())
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
@@ -45,9 +45,9 @@ def describe_exception(error: BaseException) -> str:
 
 class CheckedEnv(gym.Wrapper):
     """
-    Raise :class:`EnvironmentFaultError` for every exception, and for what an environment must not return.
+    A wrapper that raises :class:`EnvironmentFaultError` for every exception and every invalid return value.
 
-    NumPy would broadcast an observation of another shape into the batch, and take None for False.
+    Without it, NumPy would broadcast an observation of the wrong shape into the batch, and convert None to False.
     """
 
     def reset(self, **kwargs: Any) -> Any:
@@ -74,7 +74,7 @@ class CheckedEnv(gym.Wrapper):
         return result
 
     def close(self) -> None:
-        """Close; what goes wrong is only a warning, as training is over."""
+        """Close the environment; an error becomes a warning, as training is over."""
         try:
             super().close()
         except _FAILURES as error:
@@ -111,7 +111,7 @@ def _check_info(name: str, info: Any) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    """Return whether it is a bool, a number, or an array of one."""
+    """Return whether a value is a bool, a number, or an array that holds one."""
     if isinstance(value, (bool, int, float)):
         return True
     array = _as_array(value)
@@ -126,7 +126,7 @@ def _as_array(value: Any) -> np.ndarray:
 
 
 def _why_not_in(value: Any, space: gym.Space, name: str = "") -> str:
-    """Return "" for what can be stored as an observation of a space, else what it should have been, and is."""
+    """Return "" if a value can be stored as an observation of a space, else what it must be and what it is."""
     if isinstance(space, spaces.Dict):
         if not isinstance(value, Mapping) or set(space) - set(value):
             return f"a dict with {', '.join(map(repr, space))}, got {_describe(value)}"
@@ -146,7 +146,7 @@ def _why_not_in(value: Any, space: gym.Space, name: str = "") -> str:
 
 @dataclass(frozen=True)
 class _Fault:
-    """What a process sends of an exception, which need not survive pickling."""
+    """The parts of an exception that a process sends to the trainer: the exception itself may not be picklable."""
 
     sentence: str
     details: str
@@ -159,7 +159,7 @@ class _Fault:
 
 
 class _Reporting(gym.Wrapper):
-    """Send faults to the trainer: SB3's process would die of them, with a traceback on the screen."""
+    """A wrapper that sends faults to the trainer: SB3's worker would die of them, with a traceback on the screen."""
 
     fault: _Fault | None = None
 
@@ -176,7 +176,7 @@ class _Reporting(gym.Wrapper):
             return self.observation_space.sample(), 0.0, False, False, {_FAULT: _Fault.of(error)}
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """Return an attribute; a method of ``env_method`` returns its fault."""
+        """Return an attribute; a method, to be called by ``env_method``, returns its fault instead of raising it."""
         value = super().get_wrapper_attr(name)
         if not inspect.ismethod(value):
             return value
@@ -192,7 +192,7 @@ class _Reporting(gym.Wrapper):
 
 
 class _Unmade(gym.Env):
-    """Stands for an environment that could not be made."""
+    """A placeholder for an environment that could not be made."""
 
     observation_space = action_space = spaces.Box(-1, 1, (1,))
 
@@ -209,9 +209,9 @@ def _make_reporting(make_env: Callable[[], gym.Env]) -> gym.Env:
 
 class CheckedSubprocVecEnv(SubprocVecEnv):
     """
-    A ``SubprocVecEnv`` that raises :class:`EnvironmentFaultError` for a fault in one of its processes, or its death.
+    A ``SubprocVecEnv`` that raises :class:`EnvironmentFaultError` if an environment fails or its process dies.
 
-    :raises EnvironmentFaultError: also if an environment cannot be made
+    :raises EnvironmentFaultError: if an environment cannot be made
     """
 
     def __init__(self, env_fns: list[Callable[[], gym.Env]], start_method: str | None = None):
@@ -224,7 +224,7 @@ class CheckedSubprocVecEnv(SubprocVecEnv):
             raise EnvironmentFaultError(sentence) from error
         self._watch()
         try:
-            self.get_attr("fault")  # raises that of an environment that could not be made
+            self.get_attr("fault")  # raises the fault of an environment that could not be made
         except EnvironmentFaultError:
             self._kill()
             raise
@@ -256,7 +256,7 @@ class CheckedSubprocVecEnv(SubprocVecEnv):
                 remote.fail(info[_FAULT])
 
     def close(self) -> None:
-        """Close, also where processes have died: the answers of the others may never have been received."""
+        """Close the environments; if a process has died, kill the others, whose answers may still be unread."""
         if not any(remote.is_dead for remote in self.remotes):
             with suppress(EnvironmentFaultError):
                 return super().close()
@@ -272,9 +272,9 @@ class CheckedSubprocVecEnv(SubprocVecEnv):
 
 class _Remote:
     """
-    The trainer's end of a pipe.
+    The trainer's end of the pipe to a process of an environment.
 
-    :param process: at the other end
+    :param process: the process at the other end
     """
 
     def __init__(self, index: int, connection: Any, process: Any):
@@ -307,7 +307,7 @@ class _Remote:
         return EnvironmentFaultError(self.describe_death())
 
     def describe_death(self) -> str:
-        """Return how the process ended."""
+        """Return a sentence on how the process ended."""
         self.process.join(_SECONDS_TO_DIE)
         code = self.process.exitcode
         if code is None:

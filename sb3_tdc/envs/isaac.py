@@ -1,9 +1,9 @@
 """
-Isaac Lab's tasks (``Isaac-…-v0``): the application first, then the tasks, then Isaac Lab's own ``Sb3VecEnvWrapper``.
+Isaac Lab's tasks (``Isaac-…-v0``): starts the application, imports the tasks, and uses the ``Sb3VecEnvWrapper``.
 
-Written against the three published interfaces of that wrapper: with ``fast_variant`` (Isaac Lab 2.3), then with
-``action_low`` and ``action_high``, then with ``action_bounds`` (September 2026). What they do differently is corrected
-by what they do, whichever it is. It has been run with a stand-in for each of them, not with Isaac Sim itself.
+Written for the three published interfaces of that wrapper: with ``fast_variant`` (Isaac Lab 2.3), then with
+``action_low`` and ``action_high``, then with ``action_bounds`` (September 2026). Their differences are recognised by
+their behaviour, not by a version, and corrected. Tested with a stand-in for each, not with Isaac Sim itself.
 """
 
 import importlib.util
@@ -26,14 +26,14 @@ _INSTALL = "https://isaac-sim.github.io/IsaacLab/main/source/setup/installation"
 
 class IsaacVecEnv(VecEnvWrapper):
     """
-    What SB3's off-policy algorithms need of a ``VecEnv``, around Isaac Lab's.
+    A wrapper around Isaac Lab's ``VecEnv`` that provides what SB3's off-policy algorithms require.
 
-    - Actions without bounds are in [-1, 1]. Isaac Lab gave them [-100, 100], over which tanh spreads them (issue 5080).
+    - Unbounded actions get the bounds [-1, 1]. Isaac Lab gave them [-100, 100], to which tanh is scaled (issue 5080).
     - The last observation of an episode is the one before the reset. Where Isaac Lab gives the one after the reset
       instead, a time-out counts as the end of the task: there is nothing to bootstrap from.
-    - Attributes and wrappers are those of all environments.
+    - There is one simulation for all environments: attributes cannot be set, and no single environment is wrapped.
 
-    :param env: a ``Sb3VecEnvWrapper`` of any interface
+    :param env: a ``Sb3VecEnvWrapper`` with any of the three interfaces
     """
 
     def __init__(self, env: VecEnv):
@@ -82,9 +82,9 @@ def _is_same(last: Any, observations: Any, i: int) -> bool:
 
 def register() -> None:
     """
-    Start the application, in which alone the tasks can be imported, and register them.
+    Start Isaac Lab's application, without which the tasks cannot be imported, and register the tasks.
 
-    :raises ValueError: if Isaac Lab is not installed, with where to find out how
+    :raises ValueError: if Isaac Lab is not installed, with the address of the installation guide
     """
     try:
         if not _is_installed():
@@ -102,7 +102,7 @@ def _is_installed() -> bool:
 
 @contextmanager
 def _without_arguments() -> Iterator[None]:
-    """Hide the arguments of ``sb3-tdc train``, which the application would read as its own."""
+    """Hide the command-line arguments of this process, which the application would read as its own."""
     arguments, sys.argv = sys.argv, sys.argv[:1]
     try:
         yield
@@ -112,11 +112,11 @@ def _without_arguments() -> Iterator[None]:
 
 def make_vec(env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]) -> VecEnv:
     """
-    Make all environments: one simulation, in which they are stepped together.
+    Make all environments in one simulation, in which they are stepped together.
 
-    :param env_kwargs: over the task's configuration, with dots for what is inside (``sim.dt``), but for ``device``,
-        the simulation's, and ``render_mode``
-    :raises ValueError: for a setting that the configuration does not have
+    :param env_kwargs: override the task's configuration, with dots for nested settings (``sim.dt``); only ``device``
+        (of the simulation) and ``render_mode`` are not part of the configuration
+    :raises ValueError: if the configuration has no such setting
     """
     settings = {"device": "cuda:0", "render_mode": None, **env_kwargs}
     parse = importlib.import_module("isaaclab_tasks.utils").parse_env_cfg
@@ -129,7 +129,7 @@ def make_vec(env_id: str, n_envs: int, seed: int, env_kwargs: dict[str, Any]) ->
         _set(config, name, value, env_id)
     wrapper = importlib.import_module("isaaclab_rl.sb3").Sb3VecEnvWrapper
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*unbounded action space")  # it has bounds here
+        warnings.filterwarnings("ignore", message=".*unbounded action space")  # IsaacVecEnv bounds it
         return IsaacVecEnv(wrapper(gym.make(env_id, cfg=config, render_mode=render_mode)))
 
 

@@ -18,7 +18,7 @@ from sb3_tdc.hyperparams import Hyperparams
 from sb3_tdc.resume import Restorable
 from sb3_tdc.safe_load import load_normalization
 
-# What constructors of environments, wrappers, algorithms and callbacks raise for what they do not allow
+# Errors that constructors of environments, wrappers, algorithms and callbacks raise for arguments they do not allow
 SETUP_ERRORS = (ValueError, AssertionError, TypeError, RuntimeError, ImportError, OSError, EOFError, gym.error.Error)
 
 
@@ -35,20 +35,20 @@ def make_envs(
     trust: bool = False,
 ) -> VecEnv:
     """
-    Make the environments of a run, wrapped as its hyperparameters say.
+    Make the environments of a run, with the wrappers of its hyperparameters.
 
-    :param env_kwargs: of the environment's constructor, over those of the hyperparameters
-    :param vec_env: "dummy" (one process), "subproc", or "gymnasium" (what ``gymnasium.make_vec`` makes)
-    :param monitor_folder: for ``*.monitor.csv``
+    :param env_kwargs: keyword arguments of the environment's constructor; override those of the hyperparameters
+    :param vec_env: "dummy" (one process), "subproc" (one process each), or "gymnasium" (``gymnasium.make_vec``)
+    :param monitor_folder: folder of the files ``*.monitor.csv``
     :param normalization: saved statistics for ``VecNormalize``
-    :param training: False: statistics stay as they are and rewards are not normalised
+    :param training: if False, the statistics do not change and rewards are not normalised
     :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
     """
     kwargs = {**hyperparams.env_kwargs, **(env_kwargs or {})}
     env = _make(_Wanted(env_id, hyperparams, seed, n_envs, kwargs, vec_env, monitor_folder))
     for wrapper in hyperparams.vec_env_wrapper:
         env = wrapper(env)
-    if hyperparams.frame_stack is not None:  # before normalising: replay stores what VecNormalize was given
+    if hyperparams.frame_stack is not None:  # inside VecNormalize, whose input the replay buffer stores
         env = VecFrameStack(env, hyperparams.frame_stack)
     if hyperparams.normalize is not None:
         if normalization is not None:
@@ -110,7 +110,7 @@ def _make_sb3(wanted: _Wanted) -> VecEnv:
 
 
 def _make_gymnasium(wanted: _Wanted) -> VecEnv:
-    """Make the vector environment that is registered for an id, or else single ones stepped in turn."""
+    """Make the vector environment that is registered for an id, or else single environments stepped in turn."""
     if not hasattr(gym.vector, "AutoresetMode"):
         raise ValueError(f"--vec-env gymnasium needs Gymnasium 1.1 or newer: this is {gym.__version__}")
     print_warnings_once()
@@ -127,7 +127,7 @@ def _make_gymnasium(wanted: _Wanted) -> VecEnv:
 
 
 def _maker(env_id: str, hyperparams: Hyperparams, ignores_signals: bool) -> Any:
-    """Return what makes one environment, perhaps in a process of its own. Its ``Monitor`` will be the outermost."""
+    """Return a function that makes one environment, possibly in a new process. The caller adds a monitor around it."""
     spec, simulator = gym.spec(env_id), simulator_of(env_id)
 
     def make_env(**kwargs: Any) -> gym.Env:

@@ -1,4 +1,4 @@
-"""Processes of environments: they ignore the signals that stop the trainer, and never outlive it."""
+"""Processes of environments, which ignore the signals that stop the trainer and never outlive it."""
 
 import multiprocessing
 import signal
@@ -12,7 +12,7 @@ STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 
 
 def ignore_signals() -> None:
-    """Ignore the signals that reach the whole group of processes: the trainer still needs its environments."""
+    """Ignore the signals that are sent to the whole process group: the trainer still needs its environments."""
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
@@ -32,7 +32,7 @@ def ended_processes() -> Iterator[None]:
 
 @contextmanager
 def closing_envs(env: VecEnv) -> Iterator[VecEnv]:
-    """Close environments after this block; after a Ctrl-C, which may come in the middle of a step, without waiting."""
+    """Close environments after this block; after Ctrl-C, possibly in the middle of a step, kill their processes."""
     try:
         yield env
     except KeyboardInterrupt:

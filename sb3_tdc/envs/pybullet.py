@@ -33,7 +33,7 @@ def register() -> None:
 
 
 def make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
-    """Make an environment, and load its world now, not at the first reset: exact resume restores into what is there."""
+    """Make an environment and load its world at once, by a reset: exact resume restores into an existing world."""
     with _quiet():
         env = spec.make(**env_kwargs)
         env.reset(seed=0)
@@ -42,7 +42,7 @@ def make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Drop what C code prints: PyBullet announces itself at its import and at every connection. Warnings come later."""
+    """Drop the output of PyBullet's C code at its import and at every connection; show Python's warnings afterwards."""
     with warnings.catch_warnings(record=True) as caught, ExitStack() as stack:
         if os.name == "posix":
             libc = ctypes.CDLL(None)

@@ -1,4 +1,4 @@
-"""From an environment id to a registered environment: packages, simulators, and what to say if there is none."""
+"""From an environment id to a registered environment: packages, simulators, and the errors if there is none."""
 
 import difflib
 import importlib
@@ -11,7 +11,7 @@ from sb3_tdc.envs.mujoco import check_opengl
 from sb3_tdc.envs.pybullet import PYBULLET
 from sb3_tdc.envs.simulator import GYMNASIUM, Simulator
 
-# The first that provides an environment registers and makes it
+# The first simulator in this order that provides an environment registers and makes it
 SIMULATORS = (PYBULLET, ISAAC, GYMNASIUM)
 
 
@@ -26,7 +26,7 @@ def is_of_mujoco(env_id: str) -> bool:
 
 
 def has_vector_env(env_id: str) -> bool:
-    """Return whether a vector environment of its own is registered for an id."""
+    """Return whether a custom vector environment is registered for an id."""
     return gym.spec(env_id).vector_entry_point is not None
 
 
@@ -34,8 +34,8 @@ def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
     """
     Split ``package:Env-v0``.
 
-    :param packages: those that are named elsewhere
-    :return: the environment's id alone, and all packages
+    :param packages: packages that are named elsewhere
+    :return: the environment's id without the package, and all packages
     """
     package, _, env_id = env_id.rpartition(":")
     return env_id, [*packages, *([package] if package and package not in packages else [])]
@@ -45,7 +45,7 @@ def import_packages(packages: Sequence[str]) -> None:
     """
     Import packages that register environments.
 
-    :raises ValueError: for one that is not installed, with the command that installs it
+    :raises ValueError: if a package or one of its imports is not installed, with the command that installs it
     """
     for package in packages:
         try:
@@ -60,8 +60,8 @@ def require_env(env_id: str) -> None:
     """
     Let the simulator of an environment register it, and check that it is registered.
 
-    :raises ValueError: if the simulator is not installed, with the command that installs it; if it is MuJoCo and finds
-        no OpenGL; if there is no such environment, with the nearest
+    :raises ValueError: if the simulator is not installed, with the command that installs it; if MuJoCo finds no
+        OpenGL; if there is no such environment, with the ids closest to it
     """
     if env_id not in gym.registry:
         simulator_of(env_id).register()

@@ -1,4 +1,4 @@
-"""Pictures without a display: which OpenGL backend MuJoCo can use, and video files."""
+"""Rendering with and without a display: MuJoCo's OpenGL backend, the render mode, and video files."""
 
 import inspect
 import itertools
@@ -21,7 +21,7 @@ from sb3_tdc.envs.registry import is_of_mujoco
 VIDEO_SUFFIXES = (".mp4", ".gif", ".mkv", ".mov", ".avi")
 _GL_BACKENDS = ("egl", "osmesa")
 _TRY_DISPLAY = "import sys, glfw; sys.exit(not glfw.init())"
-# GLFW's context is made without a display too; only what draws fails
+# GLFW creates a context even without a display; only MjrContext, which is for drawing, then fails
 _TRY_BACKEND = """
 import mujoco
 context = mujoco.GLContext(16, 16)
@@ -33,9 +33,9 @@ context.free()
 
 def render_modes(env_id: str) -> set[str]:
     """
-    Return the modes that an environment can be made with: none if its constructor takes no ``render_mode``.
+    Return the render modes of an environment: none if its constructor takes no ``render_mode``.
 
-    :raises ValueError: if what makes it cannot be imported
+    :raises ValueError: if its entry point cannot be imported
     """
     spec = gym.spec(env_id)
     entry_point: Any = spec.entry_point or spec.vector_entry_point
@@ -46,12 +46,12 @@ def render_modes(env_id: str) -> set[str]:
     parameters = inspect.signature(creator).parameters.values()
     if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
         return set()
-    metadata = getattr(creator, "metadata", None) or {}  # a function has none: it may draw anything
+    metadata = getattr(creator, "metadata", None) or {}  # a function has no metadata: assume both modes
     return set(metadata.get("render_modes", ("human", "rgb_array")))
 
 
 def display_works() -> bool:
-    """Return whether a window can be opened: a display may be named that is gone (ssh -X, tmux)."""
+    """Return whether a window can be opened: ``DISPLAY`` may name a display that is gone (ssh -X, tmux)."""
     if sys.platform in ("darwin", "win32"):
         return True
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -64,11 +64,11 @@ def choose_gl_backend(is_window: bool = False) -> str:
     """
     Set ``MUJOCO_GL`` to a backend that works without a display, unless it is set already or there is a display.
 
-    To be called before ``mujoco`` is imported: it reads the variable then.
+    Must be called before ``mujoco`` is imported, which reads the variable.
 
-    :param is_window: whether a window is wanted, for which there is a display
-    :return: a sentence on what is used
-    :raises ValueError: if what is set does not work, or nothing does, with the commands that install one
+    :param is_window: whether a window is wanted; there must be a display
+    :return: a sentence that names the backend
+    :raises ValueError: if the given backend does not work; if none works, with the command that installs one
     """
     if named := os.environ.get("MUJOCO_GL"):
         if not is_window and not _backend_works(named):
@@ -95,13 +95,13 @@ def _backend_works(backend: str) -> bool:
 
 
 def follow_agent(env: gym.Env) -> None:
-    """Let MuJoCo's pictures follow the agent, unless the environment was given a camera (-v4 tasks lose it)."""
+    """Make MuJoCo's camera follow the agent, unless the environment was given a camera (-v4 tasks lose the agent)."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if renderer is None or renderer.camera_id not in (None, -1):
         return
     import mujoco
 
-    # Frames are taken from a camera of the model, a window from the camera that the configuration describes
+    # Frames use a camera of the model; a window uses the camera that the configuration describes
     renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
     torso = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_BODY, "torso")
     if torso != -1:
@@ -113,13 +113,13 @@ def choose_render_mode(
     env_id: str, env_kwargs: dict[str, Any], record: bool = False, window: bool = True
 ) -> tuple[dict[str, Any], list[str]]:
     """
-    Decide what is drawn; MuJoCo's backend is chosen before it is imported.
+    Choose the render mode of an environment, and MuJoCo's OpenGL backend before MuJoCo is imported.
 
-    :param env_kwargs: what the environment is made with anyway; a ``render_mode`` there is one that it needs
-    :param record: whether pictures are wanted
-    :param window: whether a window is wanted, if no pictures are
-    :return: the ``render_mode`` to add to its arguments, if any, and sentences on what is drawn or is not
-    :raises ValueError: if it cannot be recorded
+    :param env_kwargs: the environment's other keyword arguments; a ``render_mode`` among them is not changed
+    :param record: whether frames for a video are wanted
+    :param window: whether a window is wanted if no video is
+    :return: the ``render_mode`` to add to the keyword arguments, if any; sentences for the user on what is drawn
+    :raises ValueError: if the environment cannot be recorded
     """
     needed, modes = env_kwargs.get("render_mode"), render_modes(env_id)
     wanted = "rgb_array" if record else "human" if window else None
@@ -167,7 +167,7 @@ class VideoWriter:
 
     def add(self, frame: np.ndarray) -> None:
         """
-        Write a frame, if there are not too many of them for the format.
+        Write a frame; a GIF leaves some out if there are too many per second for the format.
 
         :param frame: (height, width, 3), uint8
         """
@@ -186,7 +186,7 @@ class VideoWriter:
 
 class Filmed(VecEnvWrapper):
     """
-    Write a frame to a video before every step.
+    A wrapper that writes a frame to a video before every step.
 
     :param venv: one environment, made with ``render_mode="rgb_array"``
     """
@@ -210,9 +210,9 @@ class Filmed(VecEnvWrapper):
 
 def _timing_of_gif(fps: float) -> tuple[int, int]:
     """
-    Return how often a frame is shown, and for how many hundredths of a second: so that time runs as in the simulation.
+    Return the n of "every n-th frame" and a frame's duration in hundredths of a second, to match the simulated time.
 
-    A GIF counts in hundredths, and players slow down frames of less than two.
+    A GIF stores durations in hundredths of a second, and players slow down frames of less than two hundredths.
     """
     delays = (100 * every / fps for every in itertools.count(1))
     every, delay = next((n, d) for n, d in enumerate(delays, 1) if d >= 2 and abs(round(d) - d) <= 0.1 * d)

@@ -1,4 +1,4 @@
-"""What a simulator's file declares, so that its environments are made like all others."""
+"""The declaration of a simulator, by which its environments are made like all others."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ def _make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
 @dataclass(frozen=True)
 class Simulator:
     """
-    How the environments of one simulator are registered and made.
+    The functions that register and make the environments of one simulator.
 
-    :param provides: whether an environment id is one of its own
+    :param provides: returns whether an environment id belongs to the simulator
     :param register: registers its environments; raises ``ValueError``, with the install command, if it is not installed
     :param make: makes one environment, given its registered spec and the constructor's arguments
-    :param make_vec: of a simulator that makes all environments of a process at once, and once only: takes the id, the
-        number of environments, the seed and the arguments
+    :param make_vec: only for a simulator that makes all environments of a process at once, and only once; takes the id,
+        the number of environments, the seed and the constructor's arguments
     """
 
     provides: Callable[[str], bool]
@@ -35,5 +35,5 @@ class Simulator:
     make_vec: Callable[[str, int, int, dict[str, Any]], VecEnv] | None = None
 
 
-# All that is registered already, or by the package that the user names
+# All environments that are registered already, or by a package that the user names
 GYMNASIUM = Simulator(provides=lambda env_id: True)

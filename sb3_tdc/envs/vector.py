@@ -1,14 +1,14 @@
 """
 Gymnasium's vector environments as SB3's ``VecEnv``: those of ``gym.make_vec``, and of massively parallel simulators.
 
-SB3 wants the first observation of the next episode in the step that ends one, and the last observation in its info. How
-Gymnasium gets there depends on the autoreset mode:
+SB3 expects the step that ends an episode to return the first observation of the next one, and its info to hold the
+last observation. How to obtain both depends on Gymnasium's autoreset mode:
 
-- SAME_STEP: the environment has done so; last observation and info are in ``final_obs`` and ``final_info``.
-- NEXT_STEP: the next step would ignore the action of an environment that has ended, return the first observation and a
-  reward of 0. That is no transition, and must not be learnt from: the environment is reset at once instead; if all
-  have ended, by that step.
-- DISABLED: the caller has to reset it, which is done here.
+- SAME_STEP: the environment resets itself in that step; last observation and info are in ``final_obs``, ``final_info``.
+- NEXT_STEP: for an environment that has ended, the next step would ignore the action, and return the first observation
+  and a reward of 0. That is no transition and must not be learnt from, so the environment is reset at once instead. If
+  all have ended, they are reset by taking that next step at once.
+- DISABLED: the caller has to reset the environment, which is done here.
 """
 
 from collections.abc import Sequence
@@ -27,22 +27,22 @@ _REMEDY = "make it with autoreset_mode=AutoresetMode.SAME_STEP"
 
 class GymnasiumVecEnv(VecEnv):
     """
-    Any of Gymnasium's vector environments, with arrays of NumPy or tensors.
+    Any of Gymnasium's vector environments, with NumPy arrays or tensors, as a ``VecEnv``.
 
-    :param env: of any autoreset mode; for the last two, its ``reset`` must know the option ``reset_mask``, as
-        Gymnasium's own do since 1.1
-    :raises ValueError: if its spaces are of a kind that SB3 does not know, or it cannot reset single environments
+    :param env: with any autoreset mode; for NEXT_STEP and DISABLED, its ``reset`` must support the option
+        ``reset_mask``, as Gymnasium's own environments do since 1.1
+    :raises ValueError: if SB3 does not support its observation space, or it cannot reset single environments properly
     """
 
     def __init__(self, env: VectorEnv):
         if isinstance(env.single_observation_space, spaces.Tuple):
             raise ValueError(f"SB3 knows no Tuple observations, and {env} has them")
         self.env = env
-        mode = env.metadata.get("autoreset_mode", "NextStep")  # Gymnasium 1.0 has no other, and does not say so
+        mode = env.metadata.get("autoreset_mode", "NextStep")  # Gymnasium 1.0 has only this mode, and no such entry
         name = getattr(mode, "value", mode)
         self.resets_itself, self._resets_in_next_step = name == "SameStep", name == "NextStep"
         if isinstance(env.unwrapped, AsyncVectorEnv) and not env.unwrapped.shared_memory and mode is not _SAME_STEP:
-            # Its processes would reset once more in the next step (Gymnasium 1.4)
+            # Its processes would reset again in the next step (Gymnasium 1.4)
             raise ValueError(f"{env} without shared memory resets twice: {_REMEDY}")
         self._actions: np.ndarray | None = None
         self._can_reset_some: bool | None = None  # not known yet
@@ -50,7 +50,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         options = self._common_options()
-        # Some take one number only; from it, Gymnasium counts up for the other environments, as SB3 has done here
+        # Some environments accept only a single seed; Gymnasium counts up from it for the others, as SB3's seed() does
         seed = None if self._seeds[0] is None else int(self._seeds[0])
         seeded: Any = {"seed": seed, "options": options} if options else {"seed": seed}
         observations, infos = self.env.reset(**seeded)
@@ -77,7 +77,7 @@ class GymnasiumVecEnv(VecEnv):
     def _end_episodes(
         self, observations: Any, infos: list[dict[str, Any]], dones: np.ndarray
     ) -> tuple[Any, list[dict[str, Any]]]:
-        """Return the first observations of the next episodes, and infos with the last ones of those that have ended."""
+        """Return the first observations of the next episodes, and infos with the last ones of the ended episodes."""
         if self.resets_itself:
             for i in map(int, np.flatnonzero(dones)):
                 last, final = infos[i].pop("final_obs"), infos[i].pop("final_info", {})
@@ -93,7 +93,7 @@ class GymnasiumVecEnv(VecEnv):
         return first, infos
 
     def _reset_some(self, observations: Any, mask: np.ndarray) -> tuple[Any, dict[str, Any]]:
-        if mask.all() and self._resets_in_next_step:  # also where no single one can be reset
+        if mask.all() and self._resets_in_next_step:  # works even if single environments cannot be reset
             results = self.env.step(self._actions)
             return to_numpy(results[0]), results[4]
         before = copy_of(observations)
@@ -129,7 +129,7 @@ class GymnasiumVecEnv(VecEnv):
 
     @property
     def has_single_envs(self) -> bool:
-        """Whether a method of one environment can be called, and not only that of all."""
+        """Whether methods can be called on a single environment, and not only on all at once."""
         return self._envs is not None or (self.num_envs == 1 and hasattr(self.env, "call"))
 
     @property
@@ -195,10 +195,10 @@ def take(observations: Any, i: int) -> Any:
 
 def split_infos(infos: dict[str, Any], n_envs: int) -> list[dict[str, Any]]:
     """
-    Return the info of every environment.
+    Split the infos of a vector environment into one dict for each environment.
 
-    :param infos: of all: arrays by name, each with a mask ``_name`` of the environments that have it; what is not of as
-        many parts as there are environments is every environment's
+    :param infos: arrays by name, each with a mask ``_name`` of the environments that have this info; a value that does
+        not have one part per environment belongs to all environments
     """
     split: list[dict[str, Any]] = [{} for _ in range(n_envs)]
     names = [name for name in infos if not (name.startswith("_") and name[1:] in infos)]
@@ -207,7 +207,7 @@ def split_infos(infos: dict[str, Any], n_envs: int) -> list[dict[str, Any]]:
         values = infos[name]
         parts: Any = split_infos(values, n_envs) if isinstance(values, dict) else values
         parts = to_numpy(parts) if hasattr(parts, "detach") else parts
-        # One value, a log for instance
+        # A single value for all, for instance a log
         is_of_all = isinstance(parts, str) or not hasattr(parts, "__len__") or len(parts) != n_envs
         for i in map(int, np.flatnonzero(mask)):
             split[i][name] = parts if is_of_all else parts[i]

@@ -1,4 +1,4 @@
-"""The algorithms that runs may be of, by name: those of the package, and the variants that the experiments compare."""
+"""The algorithms that a run can use, by name: those of the package, and the variants that the experiments compare."""
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 

@@ -1,4 +1,4 @@
-"""Read the evaluations that a run has left."""
+"""The evaluations of a run, read from its folder."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +26,8 @@ def read_evaluations(run: RunFolder) -> Evaluations | None:
     """
     Read the evaluations of a run.
 
-    :return: None if it has not been evaluated
-    :raises ValueError: if the file cannot be read, or has something else than returns of evaluations
+    :return: the evaluations, or None if the run has not been evaluated
+    :raises ValueError: if the file cannot be read, or holds anything other than returns of evaluations
     """
     path = run.evaluations
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""Explain a trained model: what its critics predict, against what follows."""
+"""Explanation of a trained model: the returns that its critics predict, compared with those that follow."""
 
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from sb3_tdc.tdc import TDC
 
 def extend_time_limit(trained: TrainedModel, env_kwargs: dict[str, Any]) -> tuple[int | None, dict[str, Any]]:
     """
-    Let episodes last longer than their time limit, until the discount has faded: critics predict returns without it.
+    Extend the time limit of episodes until the discount has faded: critics predict returns as if there were no limit.
 
-    :return: the environment's own limit, None for none, and the arguments with the later one
+    :return: the original time limit (None for none), and the environment's arguments with the extended one
     """
     own = gym.spec(trained.env_id).max_episode_steps
     limit = {**trained.hyperparams.env_kwargs, **env_kwargs}.get("max_episode_steps", own)
@@ -28,9 +28,9 @@ def extend_time_limit(trained: TrainedModel, env_kwargs: dict[str, Any]) -> tupl
 
 
 def explain(model: TDC, env: VecEnv, trained: TrainedModel, n_episodes: int, limit: int | None) -> None:
-    """Play episodes, and draw what the critics predict next to the model."""
+    """Play episodes, and write a figure of the critics' predictions into the folder of the model."""
     normalization = unwrap_vec_normalize(env)
-    if normalization is not None:  # the critics know no other rewards
+    if normalization is not None:  # the critics predict returns of training's rewards
         normalization.norm_reward = (trained.hyperparams.normalize or {}).get("norm_reward", True)
     episodes = record_episodes(model, env, n_episodes, limit)
     unit = "normalised rewards, " if normalization is not None and normalization.norm_reward else ""
@@ -42,5 +42,5 @@ def explain(model: TDC, env: VecEnv, trained: TrainedModel, n_episodes: int, lim
 
 
 def explanation_path(trained: TrainedModel) -> Path:
-    """Return the files that :func:`explain` writes, without their endings."""
+    """Return the path of the files that :func:`explain` writes, without their suffixes."""
     return trained.path.with_name(f"{trained.path.stem}_critics")

@@ -1,4 +1,4 @@
-"""Where a run keeps its files: RL Zoo's layout, ``logs/tdc/Walker2d-v4_1/…``."""
+"""The folder with the files of a run, in RL Zoo's layout: ``logs/tdc/Walker2d-v4_1/…``."""
 
 import re
 import shlex
@@ -19,7 +19,7 @@ from sb3_tdc.common.versions import commit_of_the_code, library_versions, proces
 from sb3_tdc.safe_load import read_data
 from sb3_tdc.safe_load.regular_files import read_text
 
-_MAX_YAML = 2**18  # bytes; what train.py and RL Zoo write has some thousands
+_MAX_YAML = 2**18  # bytes; the files of train.py and RL Zoo have a few thousand
 _CHECKPOINT = re.compile(r"rl_model_(\d+)_steps\.zip")
 
 
@@ -30,7 +30,7 @@ class RunFolder:
 
     :param path: ``<log folder>/<algo>/<environment>_<number>``
     :param env_name: the environment's id, without slashes
-    :param outermost: of the folders that were made for it; None if it was opened
+    :param outermost: the outermost folder that was made for the run; None if the run was opened
     """
 
     path: Path
@@ -40,7 +40,7 @@ class RunFolder:
     @classmethod
     def create(cls, log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> "RunFolder":
         """
-        Make the next free folder; two runs that start at once get one each.
+        Make the folder with the next free number; two runs that start at the same time get different ones.
 
         :param unique: append a UUID to the name
         """
@@ -51,10 +51,10 @@ class RunFolder:
         return cls(path, env_name, outermost=missing[-1] if missing else path)
 
     def remove(self) -> None:
-        """Remove the folder of a run that never began, and those that were made for it, unless others use them."""
+        """Remove the folder of a run that never began, and the parent folders made for it, if they are empty."""
         shutil.rmtree(self.path, ignore_errors=True)
         made = (each for each in self.path.parents if self.outermost and each.is_relative_to(self.outermost))
-        with suppress(OSError):  # one that is not empty
+        with suppress(OSError):  # a parent is not empty
             for parent in made:
                 parent.rmdir()
 
@@ -63,8 +63,8 @@ class RunFolder:
         """
         Find a run in a log folder.
 
-        :param number: of the run; 0 is the latest
-        :raises ValueError: if there is none
+        :param number: number of the run; 0 for the latest
+        :raises ValueError: if there is no such run
         """
         env_name, parent = folder_name(env_id), Path(log_folder) / algo
         runs = numbered(parent, env_name)
@@ -79,7 +79,7 @@ class RunFolder:
         """
         Open the folder of a run.
 
-        :raises ValueError: if the folder is not one of a run
+        :raises ValueError: if the folder is not a run folder
         """
         path = Path(path)
         if not path.exists():
@@ -92,9 +92,9 @@ class RunFolder:
     @classmethod
     def around(cls, model: Path, env_id: str) -> "RunFolder":
         """
-        Return the folder that a model lies in: that of a run, also if the model was copied there.
+        Return the folder that contains a model. It need not be a run folder, and the model may have been copied there.
 
-        :param env_id: of the model; where the folder is not of a run, files next to the model are named after it
+        :param env_id: environment of the model; used in file names if the folder is not a run folder
         """
         try:
             return cls.open(model.parent)
@@ -115,12 +115,12 @@ class RunFolder:
 
     @property
     def trained_agent(self) -> Path:
-        """A copy of the model that the run started from: its networks, if the original has moved when it is resumed."""
+        """The copy of the model that the run started from; a resumed run builds its networks from it."""
         return self.path / self.env_name / "trained_agent.zip"
 
     @property
     def config(self) -> dict[str, Any]:
-        """The hyperparameters as they were read."""
+        """The hyperparameters as given, before they are parsed."""
         return _read_yaml(self._config)
 
     @property
@@ -130,16 +130,16 @@ class RunFolder:
 
     @property
     def resume_folder(self) -> Path:
-        """Where the states are that the run can be resumed from."""
+        """The folder of the resume states."""
         return self.path / "resume"
 
     @property
     def error(self) -> Path:
-        """The traceback of what ended training."""
+        """The file with the traceback of the exception that ended training."""
         return self.path / self.env_name / "error.txt"
 
     def write_error(self, text: str) -> None:
-        """Keep a traceback, if there is room for it."""
+        """Write a traceback; a full disk is ignored."""
         with suppress(OSError):
             _write_text(self.error, text)
 
@@ -149,14 +149,14 @@ class RunFolder:
 
     @property
     def has_results(self) -> bool:
-        """Return whether something would be overwritten if the run began at step 0 again."""
+        """Return whether the run has results that would be overwritten if it began at step 0 again."""
         logs = {self.path / "progress.csv": 1, **dict.fromkeys(self.path.glob("*monitor.csv"), 2)}  # lines of a header
         has_rows = any(log.is_file() and log.read_bytes().count(b"\n") > header for log, header in logs.items())
         return has_rows or any(self.path.glob("*.zip")) or self.evaluations.is_file()
 
     @property
     def n_timesteps(self) -> int:
-        """Environment steps that the run was to take; RL Zoo leaves those of ``-n`` out of its hyperparameters."""
+        """The planned number of environment steps. In a run of RL Zoo, ``-n`` is not among the hyperparameters."""
         given = self.args.get("n_timesteps") if self._is_of_rl_zoo else None
         return int(given if isinstance(given, int) and given > 0 else self.config["n_timesteps"])
 
@@ -172,27 +172,27 @@ class RunFolder:
 
     @property
     def steps_at_end(self) -> int | None:
-        """The environment steps that a finished run has taken; None if it is not finished, or does not say so."""
+        """The environment steps that a finished run has taken; None if it is unfinished or a run of RL Zoo."""
         return int(_read_yaml(self._finished)["n_timesteps"]) if self._finished.is_file() else None
 
     @property
     def is_finished(self) -> bool:
         """
-        Whether training came to its end, which a callback may have set; after an interruption it has not.
+        Whether training ended at the last step or by a callback, and not by an interruption.
 
-        :raises ValueError: if its model cannot be read
+        :raises ValueError: if the model of a run of RL Zoo cannot be read
         """
         if self._finished.is_file():
             return True
-        # RL Zoo does not say: its run is finished if the model has all steps, unless it has been started over since
+        # RL Zoo does not record it: its run is finished if the model has all steps and was not started over since
         may_be_finished = self._is_of_rl_zoo and not self.resume_folder.exists()
         return may_be_finished and self.model.is_file() and self.steps_of_model() >= self.n_timesteps
 
     def steps_of_model(self) -> int:
         """
-        Return the environment steps that the last model was trained for.
+        Return the number of environment steps that the final model was trained for.
 
-        :raises ValueError: if it cannot be read
+        :raises ValueError: if the model cannot be read
         """
         steps = read_data(self.model).get("num_timesteps")
         return integer(0)(f"{self.model}: num_timesteps", steps)
@@ -206,11 +206,11 @@ class RunFolder:
         return self.path / self.env_name / "finished.yml"
 
     def mark_finished(self, n_timesteps: int) -> None:
-        """Record that the last step has been done, and the model saved."""
+        """Record that training has ended and the model is saved."""
         _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
 
     def mark_unfinished(self) -> None:
-        """Record that the run begins again, with the hyperparameters that it has now."""
+        """Record that the run starts over, with its current hyperparameters."""
         self._finished.unlink(missing_ok=True)
         self._changes.unlink(missing_ok=True)
 
@@ -223,7 +223,7 @@ class RunFolder:
         return dict(sorted(found.items()))
 
     def normalization(self, model: Path) -> Path:
-        """Return where the ``VecNormalize`` statistics of one of the run's models are."""
+        """Return the path of the ``VecNormalize`` statistics of one of the run's models."""
         if model.name == self.best_model.name:
             return self.path / "best_model_vecnormalize.pkl"
         if match := _CHECKPOINT.fullmatch(model.name):
@@ -232,11 +232,12 @@ class RunFolder:
 
     def find_normalization(self, model: Path) -> Path | None:
         """
-        Return the ``VecNormalize`` statistics of one of the run's models, or those of the run, if there are any.
+        Find the ``VecNormalize`` statistics of one of the run's models, or else those of its final model.
 
-        :raises ValueError: if there are none, and the run was trained with them
+        :return: their path; None if the run was trained without normalisation
+        :raises ValueError: if the run was trained with normalisation, and there are no statistics
         """
-        # RL Zoo keeps one for all its models
+        # RL Zoo keeps one file for all models of a run
         found = next((path for path in map(self.normalization, (model, self.model)) if path.is_file()), None)
         if found is None and self._config.is_file() and self.config.get("normalize"):
             missing = self.normalization(self.model)
@@ -244,16 +245,16 @@ class RunFolder:
         return found
 
     def replay_buffer(self, model: Path) -> Path:
-        """Return where the replay buffer of one of the run's models is."""
+        """Return the path of the replay buffer of one of the run's models."""
         if match := _CHECKPOINT.fullmatch(model.name):
             return self.path / f"rl_model_replay_buffer_{match[1]}_steps.pkl"
         if model.name == self.best_model.name:
-            return self.path / "best_model_replay_buffer.pkl"  # none is saved
+            return self.path / "best_model_replay_buffer.pkl"  # never saved
         return self.path / "replay_buffer.pkl"
 
     @property
     def changes(self) -> list[dict[str, Any]]:
-        """What ``-params`` changed when the run was resumed: the step, and the hyperparameters from there on."""
+        """The changes made when the run was resumed: the step of each, and the hyperparameters from there on."""
         path = self._changes
         return _read_yaml(path)["changes"] if path.is_file() else []
 
@@ -263,10 +264,10 @@ class RunFolder:
 
     def record_change(self, step: int, config: dict[str, Any], names: tuple[str, ...]) -> None:
         """
-        Store hyperparameters that are others from a step on.
+        Store hyperparameters that change at a step.
 
-        :param config: all of them, as they are now
-        :param names: of those that make another experiment of the run, if any
+        :param config: all hyperparameters, with their new values
+        :param names: the changed ones that turn the run into another experiment, if any
         """
         if names:
             change = {"step": step, "hyperparams": {name: config[name] for name in names}}
@@ -274,11 +275,11 @@ class RunFolder:
         _write_text(self._config, plain_yaml.dump(config))
 
     def record_length(self, n_timesteps: int) -> None:
-        """Store in ``args.yml`` that the run is to take another number of steps; ``config.yml`` says it too."""
+        """Store the new planned number of timesteps in ``args.yml``; ``config.yml`` has it too."""
         _write_text(self.path / self.env_name / "args.yml", plain_yaml.dump({**self.args, "n_timesteps": n_timesteps}))
 
     def write_config(self, config: dict[str, Any], args: dict[str, Any]) -> None:
-        """Keep what the run was made from: hyperparameters, arguments, the command, versions and the commit."""
+        """Write the files that describe the run: command, hyperparameters, arguments, versions and commit."""
         folder = self.path / self.env_name
         _write_text(folder / "command.txt", shlex.join(sys.orig_argv) + "\n")
         _write_text(folder / "config.yml", plain_yaml.dump(config))
@@ -291,7 +292,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     """
     Read a YAML file of the folder.
 
-    :raises ValueError: if a file is not a mapping of plain values
+    :raises ValueError: if the file is not a mapping of plain values
     """
     content = plain_yaml.load(read_text(path, _MAX_YAML), str(path), is_trusted=False)
     if not isinstance(content, dict):
@@ -304,7 +305,7 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def folder_name(env_id: str) -> str:
-    """Return an environment's id, as folders and files of its runs are named."""
+    """Return an environment's id as it appears in the names of folders and files, without slashes and colons."""
     return env_id.replace("/", "-").replace(":", "-")
 
 

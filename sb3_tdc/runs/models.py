@@ -1,4 +1,4 @@
-"""A run's model: built, loaded with what was saved next to it, or saved with the statistics of its environments."""
+"""The model of a run: building it, loading it with its replay buffer, saving it with the normalisation statistics."""
 
 import warnings
 from collections.abc import Iterator
@@ -28,17 +28,17 @@ from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, 
 from sb3_tdc.safe_load.fields import on_the_command_line
 from sb3_tdc.safe_load.models import names_code, read_model_fields
 
-# A full disk; PyTorch reports it in its own way
+# Raised when the disk is full: by Python and NumPy an OSError, by PyTorch a RuntimeError
 DISK_ERRORS = (OSError, RuntimeError)
 
 
 def make_model(algo: str, hyperparams: Hyperparams, env: VecEnv, **kwargs: Any) -> OffPolicyAlgorithm:
     """
-    Build a model as its hyperparameters say.
+    Build a model from its hyperparameters.
 
     :param algo: a key of ``KNOWN_ALGORITHMS``
     :param kwargs: further arguments of the algorithm's constructor
-    :raises ValueError: if the policy, the networks or the replay buffer do not fit the environment, or memory is short
+    :raises ValueError: if the policy or the replay buffer does not fit the environment, or there is too little memory
     """
     space = env.observation_space
     check_observation_space(space)
@@ -75,10 +75,10 @@ def continue_model(
     path: Path, algo: str, hyperparams: Hyperparams, env: VecEnv, trust: bool, **kwargs: Any
 ) -> OffPolicyAlgorithm:
     """
-    Load a model to train it further: its policy stays as it was saved, all else is as its hyperparameters say.
+    Load a model to train it further: the policy is the saved one, everything else comes from the hyperparameters.
 
     :param path: a zip
-    :raises ValueError: as :func:`load_model`, or if the replay buffer is for other environments
+    :raises ValueError: as :func:`load_model`, or if the replay buffer does not fit the environments
     """
     _check_hindsight(hyperparams, env)
     of_the_saved_model = ("policy", "policy_kwargs")
@@ -89,7 +89,7 @@ def continue_model(
 
 def load_experience(model: OffPolicyAlgorithm, path: Path, trust: bool) -> None:
     """
-    Give a model a saved replay buffer, and let it learn at once.
+    Load a saved replay buffer into a model, and let updates begin at the first step.
 
     :raises ValueError: if the buffer does not fit the model's environments
     """
@@ -111,8 +111,8 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
 
     :param algo: a key of ``KNOWN_ALGORITHMS``
     :param trust: whether the file may run code, as SB3's ``load`` lets it
-    :param kwargs: those of the algorithm's ``load``
-    :raises ValueError: if a file is not a saved model, is of another algorithm, or is refused
+    :param kwargs: further arguments of the algorithm's ``load``
+    :raises ValueError: if the file is not a saved model, is of another algorithm, or is refused
     """
     check_saved_by(path, algo)
     if trust:
@@ -124,7 +124,7 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
 
 
 def needs_trust(path: Path, algo: str) -> bool:
-    """Return whether a saved model is refused by :func:`load_model` for code that it names, such as a custom class."""
+    """Return whether :func:`load_model` refuses a model because it refers to code, such as a custom class."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -139,14 +139,14 @@ def check_saved_by(path: Path, algo: str) -> None:
     """
     Check that a zip was saved by an algorithm.
 
-    :raises ValueError: if a file is not a saved model, or is one of another algorithm
+    :raises ValueError: if the file is not a saved model, or was saved by another algorithm
     """
     policy_class = read_data(path).get("policy_class")
     module = policy_class.get("__module__") if isinstance(policy_class, dict) else None
     modules = {a: {p.__module__ for p in KNOWN_ALGORITHMS[a].policy_aliases.values()} for a in KNOWN_ALGORITHMS}
     others = [a for a in KNOWN_ALGORITHMS if module in modules[a]]
     if others and algo not in others:
-        named = list(dict.fromkeys(a.partition("-")[0] for a in others))  # variants are called after their algorithm
+        named = list(dict.fromkeys(a.partition("-")[0] for a in others))  # variants are named after their algorithm
         raise ValueError(f"{path} was saved by {' or '.join(named)}, not by {algo}: --algo {named[0]}")
 
 
@@ -164,11 +164,11 @@ def save_model(model: BaseAlgorithm, folder: RunFolder, path: Path) -> None:
 
 
 def _action_noise(hyperparams: Hyperparams, env: VecEnv) -> dict[str, Any]:
-    """Return the keyword argument for RL Zoo's ``noise_type``, if it is given; null is no noise."""
+    """Return ``action_noise`` as a keyword argument if RL Zoo's ``noise_type`` is given; null means no noise."""
     if hyperparams.noise_type is None:
         is_none = "noise_type" in hyperparams.raw and "action_noise" not in hyperparams.model
         return {"action_noise": None} if is_none else {}
-    # Of actions without axes: what fits, added to those of one environment and of several, in SB3's classes too
+    # For scalar actions, a shape that can be added to those of one or of several environments, in SB3's classes too
     shape = env.action_space.shape or ((1,) if env.num_envs == 1 else ())
     zeros, sigmas = np.zeros(shape), [np.full(shape, sigma) for sigma in np.atleast_1d(hyperparams.noise_std)]
     if hyperparams.noise_type != "normal":

@@ -1,8 +1,8 @@
 """
-What a run is told apart from its hyperparameters, declared once.
+The settings of a run other than its hyperparameters, each declared once.
 
-The flags of ``sb3-tdc train``, the run's ``args.yml``, what may change when a run is resumed, and what the report
-compares all come from :class:`RunSettings`.
+:class:`RunSettings` defines the flags of ``sb3-tdc train``, the content of the run's ``args.yml``, the settings that
+may change when a run is resumed, and those that the report compares.
 """
 
 import math
@@ -17,12 +17,12 @@ from sb3_tdc.common.checks import check_device
 from sb3_tdc.resume import DEFAULT_FREQ
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
-# NumPy takes no seed above 2**32, and environments are seeded with this one and a little more
+# NumPy accepts only seeds below 2**32, and environments are seeded with this seed plus a small number
 MAX_SEED = 2**31 - 1
 
 
 class Role(Enum):
-    """What depends on a setting."""
+    """The role of a setting: whether it may change when a run is resumed, and whether it defines the experiment."""
 
     EXPERIMENT = "another value makes another experiment, which is not averaged with this one"
     RUN = "fixed when the run begins"
@@ -32,7 +32,7 @@ class Role(Enum):
 
 
 class Group(Enum):
-    """Where a setting's flag is shown in the help."""
+    """The group of the help in which a setting's flag is shown."""
 
     RUN = "run"
     HYPERPARAMETERS = "hyperparameters"
@@ -55,11 +55,11 @@ def setting(  # type: ignore[no-untyped-def]
     """
     Declare a setting.
 
-    :param flags: on the command line; the name of the setting is the first by default
-    :param group: of flags, in the help
+    :param flags: names on the command line; by default ``--`` and the setting's name
+    :param group: the group of flags in the help
     :param minimum: the smallest number allowed
-    :param maximum: the largest
-    :param minus_one: what -1 means; None if it is not allowed
+    :param maximum: the largest number allowed
+    :param minus_one: the meaning of -1; None if -1 is not allowed
     :param parsing: further keyword arguments of ``add_argument``
     :return: a field of a dataclass
     """
@@ -73,7 +73,7 @@ def setting(  # type: ignore[no-untyped-def]
 
 @dataclass
 class RunSettings:
-    """Every setting with its flag, its default and what depends on it."""
+    """All settings of a run, each with its flag, its default and its role."""
 
     algo: str = setting(
         default="tdc",
@@ -281,7 +281,7 @@ def flags_of(declared: Field) -> tuple[str, ...]:
 
 
 def default_of(declared: Field) -> Any:
-    """Return the value of a setting that is not given."""
+    """Return the default value of a setting."""
     return declared.default if declared.default_factory is MISSING else declared.default_factory()
 
 
@@ -294,9 +294,9 @@ def check_settings(settings: RunSettings, stored_in: str = "", given: Collection
     """
     Check the numbers, the names and the device among the settings.
 
-    :param stored_in: the file that settings were read from, for the error
-    :param given: names of those that were not, but are on the command line
-    :raises ValueError: naming the first setting that is not allowed, what it was and what is allowed
+    :param stored_in: the file that the settings were read from, for the error
+    :param given: names of the settings that come from the command line instead
+    :raises ValueError: naming the first setting that is not allowed, its value and the allowed values
     """
     for each in fields(settings):
         shown_as = flags_of(each)[0] if not stored_in or each.name in given else f"{stored_in}: {each.name}"
@@ -320,5 +320,5 @@ def _check_number(declared: Field, value: Any, shown_as: str) -> None:
 
 
 def plain_arguments(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return arguments by name, with paths as texts."""
+    """Return arguments by name, with paths converted to strings."""
     return {name: str(value) if isinstance(value, Path) else value for name, value in arguments.items()}

@@ -1,4 +1,4 @@
-"""From settings to a run that can be trained: everything is checked before anything is made."""
+"""The setup of a run from its settings: everything is checked before any file is written."""
 
 import shlex
 import shutil
@@ -27,9 +27,9 @@ _COMMAND_LINE = "command line (-params)"
 
 def make_run(settings: RunSettings) -> TrainingRun:
     """
-    Check everything that can be checked, then make the run folder.
+    Check the settings and hyperparameters, then make the run folder.
 
-    :raises ValueError: for anything that is not allowed
+    :raises ValueError: if a setting or hyperparameter is not allowed
     """
     if settings.from_step is not None or settings.start_over:
         raise ValueError(f"{'--start-over' if settings.start_over else '--from'} goes with --resume RUN_FOLDER")
@@ -50,9 +50,9 @@ def make_run(settings: RunSettings) -> TrainingRun:
 
 def read_hyperparams(settings: RunSettings) -> Hyperparams:
     """
-    Read and validate the entry of the environment, overruled by ``-params`` and ``-n``; print it.
+    Read, validate and print the hyperparameters of the environment, with the overrides of ``-params`` and ``-n``.
 
-    :raises ValueError: naming the source of what is not allowed
+    :raises ValueError: if a hyperparameter is not allowed, naming the file or flag that it comes from
     """
     path = settings.conf_file or hyperparams_file(settings.algo)
     entry, name = read_entry(path, settings.env, settings.preset)
@@ -69,7 +69,7 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
 
 
 def _prepare(settings: RunSettings) -> None:
-    """Set up this process: packages that register environments, and threads."""
+    """Set up this process: import the packages that register environments, and set the number of threads."""
     import_packages(settings.gym_packages)
     require_env(settings.env)
     set_threads(settings.num_threads)
@@ -77,9 +77,9 @@ def _prepare(settings: RunSettings) -> None:
 
 def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
     """
-    Make the run folder, with everything that the run is resumed from.
+    Make the run folder, with the settings, the hyperparameters and the model that the run starts from.
 
-    :raises ValueError: if it cannot be written; nothing of it stays
+    :raises ValueError: if it cannot be written; it is then removed
     """
     folder = None
     try:
@@ -95,7 +95,7 @@ def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
 
 
 def _absolute(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the locations among arguments as they are found from any working directory."""
+    """Return the paths among the arguments, made absolute: a run may be resumed from another working directory."""
     locations = {name: arguments[name] for name in ("trained_agent", "tensorboard_log") if arguments.get(name)}
     return {name: type(location)(abspath(location)) for name, location in locations.items()}
 
@@ -105,7 +105,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     Open a run to resume it.
 
     :param given: the settings on the command line
-    :return: None if the run is finished, and not to start over
+    :return: the run; None if it is finished and ``--start-over`` is not given
     :raises ValueError: if there is nothing to resume, or a setting contradicts the run's
     """
     folder = RunFolder.open(given["resume"])
@@ -138,7 +138,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
 
 def _stored_length(folder: RunFolder, where: str) -> int:
     """
-    Return the steps that a run was to take.
+    Return the planned number of timesteps of an existing run.
 
     :raises ValueError: if ``config.yml``, which may have been edited, has no such number
     """
@@ -148,9 +148,9 @@ def _stored_length(folder: RunFolder, where: str) -> int:
 
 def _new_length(given: dict[str, Any]) -> int | None:
     """
-    Return the steps of the whole run that the command line names, as ``-n`` or among ``-params``, if any.
+    Return the new total number of timesteps given by ``-n`` or in ``-params``; None if neither is given.
 
-    :raises ValueError: if it is no integer
+    :raises ValueError: if it is not an integer
     """
     if given.get("n_timesteps", -1) != -1:
         return given["n_timesteps"]
@@ -160,9 +160,9 @@ def _new_length(given: dict[str, Any]) -> int | None:
 
 def _refuse_to_prolong(folder: RunFolder, length: int) -> None:
     """
-    Refuse another length of a finished run, which has no resume states.
+    Refuse a new length for a finished run, which has no resume states.
 
-    :raises ValueError: with the way to train its model further
+    :raises ValueError: always; if the new length is longer, with the flags that train the model further in a new run
     """
     steps = folder.steps_at_end if folder.steps_at_end is not None else folder.steps_of_model()
     if length <= steps:
@@ -176,9 +176,9 @@ def _refuse_to_prolong(folder: RunFolder, length: int) -> None:
 
 def _resumed_settings(folder: RunFolder, given: dict[str, Any]) -> RunSettings:
     """
-    Return the settings of a run, with what may differ now.
+    Return the stored settings of a run, updated with those on the command line that may change.
 
-    :raises ValueError: if something given contradicts them, or they have been edited and are not allowed
+    :raises ValueError: if the command line contradicts them, or if they have been edited and are not allowed
     """
     where = str(folder.path / folder.env_name / "args.yml")
     stored, now = _stored_settings(folder, where), {}
@@ -201,11 +201,11 @@ def _stored_settings(folder: RunFolder, where: str) -> dict[str, Any]:
     """
     Return the settings in a run's ``args.yml``, which may have been edited.
 
-    :raises ValueError: if one is of another type
+    :raises ValueError: if a setting has the wrong type
     """
     stored = folder.args
     check_arguments(stored, KNOWN_ALGORITHMS, where)
     types = {declared.name: declared.type for declared in fields(RunSettings)}
-    # RL Zoo has further arguments, and null for what is not given
+    # RL Zoo's file has further arguments, and null for those that were not given
     known = {name: value for name, value in stored.items() if name in types and value is not None}
     return convert_mapping(known, types, where)

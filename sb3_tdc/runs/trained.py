@@ -1,4 +1,4 @@
-"""Open a finished run: its model with the environment that it was trained in."""
+"""The models of trained runs, opened with the environment that they were trained in."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -18,23 +18,23 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import load_model, needs_trust
 from sb3_tdc.safe_load.run_files import check_arguments, check_imports, refused_imports
 
-# What of a run's hyperparameters the environments are made of
+# The hyperparameters of a run that its environments are built from
 _OF_THE_ENVIRONMENT = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper", "env_kwargs")
 
 
 @dataclass
 class TrainedModel:
     """
-    A saved model, and what it was trained with.
+    A saved model, with the settings that it was trained with.
 
     :param path: the zip
-    :param env_id: registered
-    :param hyperparams: those that environments are made of
-    :param env_kwargs: of training
-    :param eval_env_kwargs: of evaluations, where these differ
-    :param normalization: saved statistics of ``VecNormalize``, if it was trained with them
-    :param trust: whether its files may run code
-    :param vec_env: "gymnasium" if it was trained in the vector environment that is registered for the id, else "dummy"
+    :param env_id: id of a registered environment
+    :param hyperparams: those that the environments are built from
+    :param env_kwargs: keyword arguments of the environment in training
+    :param eval_env_kwargs: keyword arguments of the environment in evaluations, if they differ
+    :param normalization: saved statistics of ``VecNormalize``, if the model was trained with them
+    :param trust: whether the files may run code
+    :param vec_env: "gymnasium" if trained in the vector environment that is registered for the id, else "dummy"
     """
 
     path: Path
@@ -49,10 +49,10 @@ class TrainedModel:
 
     def make_env(self, seed: int, **env_kwargs: Any) -> VecEnv:
         """
-        Make one environment as in training, with statistics that stay as they are and the rewards of the environment.
+        Make one environment as in training, but with fixed normalisation statistics and unnormalised rewards.
 
-        :param env_kwargs: over those of the run
-        :raises ValueError: with what the environment or a wrapper raises
+        :param env_kwargs: override the hyperparameter ``env_kwargs``; the attribute ``env_kwargs`` is not added
+        :raises ValueError: if the environment or a wrapper raises an exception, with its message
         """
         try:
             return make_envs(
@@ -74,9 +74,9 @@ class TrainedModel:
 
     def load(self, env: VecEnv | None, device: str) -> OffPolicyAlgorithm:
         """
-        Load the model, with the smallest replay buffer there is.
+        Load the model, with a replay buffer of the smallest size.
 
-        :raises ValueError: if it is refused, or is of another algorithm
+        :raises ValueError: if the file is refused, or was saved by another algorithm
         """
         return load_model(self.path, self.algo, env, self.trust, device=device, buffer_size=1)
 
@@ -85,13 +85,13 @@ def find_model(
     run: RunFolder, best: bool = False, checkpoint: int | None = None, last_checkpoint: bool = False
 ) -> Path:
     """
-    Find one of a run's models: the last one by default.
+    Find one of a run's models, by default the final one.
 
-    :param best: the best one instead
-    :param checkpoint: the one that was saved at this step instead
-    :param last_checkpoint: the last one that was saved during training instead
+    :param best: find the best model instead
+    :param checkpoint: find the model that was saved at this step instead
+    :param last_checkpoint: find the last model of ``--save-freq`` instead
     :return: the zip
-    :raises ValueError: if there is none, with what there is
+    :raises ValueError: if the model does not exist, naming those that do
     """
     checkpoints = run.checkpoints()
     if best:
@@ -114,12 +114,12 @@ def find_model(
 
 def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: bool = False) -> TrainedModel:
     """
-    Read what a model of a run was trained with, import the packages of its environment, and check it.
+    Read and check the settings that a model of a run was trained with, and import the packages of its environment.
 
     :param path: a zip of the run
-    :param consented: packages and modules that the user has named, and whose code may therefore be imported
-    :param trust: whether the files may name any code
-    :raises ValueError: if a file is missing, damaged, or names code that is not allowed
+    :param consented: packages and modules that the user has named and that may therefore be imported
+    :param trust: whether the files may refer to any code
+    :raises ValueError: if a file is missing or damaged, or refers to code that is not allowed
     """
     trained, config = run.args, run.config
     check_arguments(trained, KNOWN_ALGORITHMS, str(run.path / run.env_name / "args.yml"))
@@ -146,7 +146,7 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
 
 
 def flags_to_open(runs: Iterable[RunFolder]) -> list[str]:
-    """Return the flags with which ``enjoy`` and ``evaluate`` open runs: the consent to the user's own code in them."""
+    """Return the flags that ``enjoy`` and ``evaluate`` require for runs with custom code: the user's consent to it."""
     runs = list(runs)
     modules = dict.fromkeys(escaped(module) for run in runs for module, _ in refused_imports(run.args, run.config))
     trust = any(needs_trust(run.model, run.args["algo"]) for run in runs if run.model.is_file())
@@ -154,6 +154,6 @@ def flags_to_open(runs: Iterable[RunFolder]) -> list[str]:
 
 
 def open_zip(path: Path, algo: str, env_id: str, trust: bool = False) -> TrainedModel:
-    """Return a model that lies outside a run, with the algorithm and the registered environment that the user names."""
+    """Return a model outside a run folder, with the algorithm and the registered environment that the user names."""
     require_env(env_id)
     return TrainedModel(path, algo, env_id, parse({"n_timesteps": 1}, KNOWN_ALGORITHMS[algo], str(path)), trust=trust)

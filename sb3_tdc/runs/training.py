@@ -1,7 +1,8 @@
 """
-One run, from its settings to its saved model.
+The training of one run, from its settings to its saved model.
 
-Called by the command line. The matrix starts processes of it; only its --dry-run trains here, to measure a rate.
+``sb3-tdc train`` calls :func:`train`. ``sb3-tdc matrix`` starts one such process for each run; only its ``--dry-run``
+calls :func:`train` in its own process, to measure the training speed.
 """
 
 import sys
@@ -48,18 +49,18 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.runs.models import DISK_ERRORS, check_saved_by, continue_model, load_experience, make_model, save_model
 from sb3_tdc.runs.settings import RunSettings
 
-# Seeds of evaluations and of a board's test episodes, above the run's: other initial states than in training
+# Added to the run's seed for evaluations and for the board's test episodes: other initial states than in training
 _EVALUATION_SEED, _BOARD_SEED = 1_000, 2_000
 
 
 @dataclass
 class TrainingRun:
     """
-    What one run is made of.
+    The settings, the hyperparameters and the folder of one run.
 
-    :param folder: which holds the settings and hyperparameters already
-    :param changed: hyperparameters that are others from here on, when the run is resumed
-    :param former_length: the steps it was to take before, if it is resumed and ``n_timesteps`` is another now
+    :param folder: the run folder, in which the settings and hyperparameters are already stored
+    :param changed: names of the hyperparameters that have a new value when the run is resumed
+    :param former_length: the planned number of steps before ``n_timesteps`` was changed; None if it was not
     """
 
     settings: RunSettings
@@ -74,7 +75,7 @@ class TrainingRun:
 
     @cached_property
     def has_state(self) -> bool:
-        """Return whether it begins from a resume state, which has more than is saved with a model."""
+        """Return whether the run continues from a resume state, which holds more than a saved model does."""
         return self.is_resumed and not self.settings.start_over and bool(stored_steps(self.folder.resume_folder))
 
     @property
@@ -85,26 +86,26 @@ class TrainingRun:
 
     @property
     def log_interval(self) -> int | None:
-        """Episodes between log entries; None for none. By default, at most one entry a step of all environments."""
+        """Episodes between log entries; None: no log. The default: at most one entry per step of all environments."""
         given = self.settings.log_interval
         return max(4, self.hyperparams.n_envs) if given == -1 else max(given, 0) or None
 
     @property
     def resume_freq(self) -> int:
-        """Environment steps between resume states. By default, at most one in 100 steps of all environments."""
+        """Environment steps between resume states. The default: at most one state per 100 steps of all environments."""
         return self.settings.resume_freq or max(DEFAULT_FREQ, 100 * self.hyperparams.n_envs)
 
 
 class NotSavedError(Exception):
-    """A trained model that cannot be written, with the reason in one sentence."""
+    """The trained model could not be written; the message gives the reason in one sentence."""
 
 
 class TrainingError(Exception):
-    """Training that an environment, a wrapper or a callback ended: the step and the reason in one sentence."""
+    """An environment, a wrapper or a callback ended training; the message gives the step and the reason."""
 
 
 class SetupError(ValueError):
-    """A run that could not begin, with the reason in one sentence."""
+    """A run could not begin; the message gives the reason in one sentence."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,8 @@ class TrainingOutcome:
     """
     How a run ended.
 
-    :param interrupted: whether the user stopped it before its last step
-    :param resume_step: the timestep from which it can be resumed, if it can
+    :param interrupted: whether the user stopped the run before its last step
+    :param resume_step: the timestep from which the run can be resumed; None if it cannot
     """
 
     model: OffPolicyAlgorithm
@@ -123,13 +124,13 @@ class TrainingOutcome:
 
 def train(run: TrainingRun) -> TrainingOutcome:
     """
-    Train from the first step to the last, or to Ctrl-C; either way the model is saved (after a second one, it is not).
+    Train until the last step or until Ctrl-C, then save the model. A second Ctrl-C stops without saving.
 
-    :raises SetupError: if the run cannot begin; its folder is removed, if it was made for it
-    :raises NonFiniteError: if training diverged; saved models stay as they are
-    :raises TrainingError: if an environment or a callback raised; the folder has the traceback
+    :raises SetupError: if the run cannot begin; the folder of a new run is removed
+    :raises NonFiniteError: if training diverged; models saved before stay as they are
+    :raises TrainingError: if an environment or a callback raised an exception; the traceback is in the run folder
     :raises NotSavedError: if the trained model cannot be written
-    :raises LockedError: if another process has begun to write to the folder
+    :raises LockedError: if another process has begun to write to the run folder
     """
     with ended_processes(), ExitStack() as stack:
         with _setting_up(run, stack):
@@ -161,7 +162,7 @@ def train(run: TrainingRun) -> TrainingOutcome:
 
 @contextmanager
 def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
-    """Close everything if this block fails, remove the folder of a new run, and give the reason in one sentence."""
+    """Raise ``SetupError`` if this block fails, after closing everything and removing the folder of a new run."""
     try:
         yield
     except BaseException as error:
@@ -172,7 +173,7 @@ def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
             raise
         if run.settings.verbose > 1:
             traceback.print_exc()
-        # Others are of wrappers, policies and callbacks that the user has written: with their place
+        # Other errors come from the user's own wrappers, policies and callbacks: say where in the code
         is_a_sentence = isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt))
         reason = " ".join(str(error).split()) if is_a_sentence else describe_exception(error)
         raise SetupError(reason or "Interrupted before training began") from error
@@ -190,7 +191,7 @@ def _announce(run: TrainingRun) -> None:
 
 
 def _warn_of_no_update(model: OffPolicyAlgorithm, n_timesteps: int) -> None:
-    """Warn of a run that ends before its first update; one of whole episodes takes a number of steps not yet known."""
+    """Warn if a run ends before its first update; with a ``train_freq`` in episodes, that is not known beforehand."""
     assert isinstance(model.train_freq, TrainFreq)
     if model.train_freq.unit is TrainFrequencyUnit.EPISODE:
         return
@@ -209,7 +210,7 @@ def _learn(run: TrainingRun, model: OffPolicyAlgorithm, callbacks: list[BaseCall
         model.learn(
             run.hyperparams.n_timesteps,
             callback=callbacks,
-            log_interval=run.log_interval,  # type: ignore[arg-type]  # None is none
+            log_interval=run.log_interval,  # type: ignore[arg-type]  # None: no log
         )
     except (NonFiniteError, NotRestoredError, LockedError):
         raise
@@ -254,7 +255,8 @@ def _open_states(run: TrainingRun) -> ResumeCallback | None:
     if settings.start_over:
         states.store.clear()
         folder.mark_unfinished()
-    if run.is_resumed and not states.store.steps():  # stopped before its first step
+    # Stopped before its first step, or started over: training begins at step 0, so do the curves
+    if run.is_resumed and not states.store.steps():
         for events in folder.path.glob("events.out.tfevents.*"):
             events.unlink()
     return states
@@ -262,22 +264,22 @@ def _open_states(run: TrainingRun) -> ResumeCallback | None:
 
 def _select_state(run: TrainingRun, states: ResumeCallback, model: OffPolicyAlgorithm) -> None:
     """
-    Select the state to resume from, and record hyperparameters that are others from there on.
+    Select the state to resume from, and record the hyperparameters that change at its step.
 
-    :raises ValueError: if there is no such state, or the run was to become shorter than it is already
+    :raises ValueError: if there is no such state, or the new number of timesteps is not above its step
     """
     folder, length = run.folder, run.hyperparams.n_timesteps
-    # Whatever has ever been changed is as in config.yml: the state may be older than the change
+    # A hyperparameter that was ever changed takes its value from config.yml: the state may be older than the change
     earlier = [name for change in folder.changes for name in change["hyperparams"] if name != "n_timesteps"]
     step = states.select(model, run.settings.from_step, [*earlier, *run.changed]) or 0
-    changed = run.changed if step > 0 else ()  # from the beginning on, it is a run like any other
+    changed = run.changed if step > 0 else ()  # at step 0, the new values hold for the whole run
     if run.former_length is None:
         if run.changed:
             folder.record_change(step, run.hyperparams.raw, changed)
         return
     if length <= step:
         raise ValueError(f"n_timesteps must be above {step:,}, the step of the resume state, got {length}")
-    # With a schedule, the steps so far are not those of a run of the new length
+    # With a schedule, the steps so far differ from those of a run that had the new length from the start
     is_another = step > 0 and bool(run.hyperparams.schedules)
     folder.record_change(step, run.hyperparams.raw, (*changed, "n_timesteps") if is_another else changed)
     folder.record_length(length)
@@ -309,7 +311,7 @@ def _make_training_envs(run: TrainingRun) -> VecEnv:
 def _make_other_envs(
     run: TrainingRun, model: OffPolicyAlgorithm, stack: ExitStack, seed: int, n_envs: int, env_kwargs: dict[str, Any]
 ) -> VecEnv:
-    """Make environments that are not trained in, wrapped as the model's."""
+    """Make environments for evaluation or test episodes, wrapped like the model's; ``seed`` is added to the run's."""
     settings = run.settings
     envs = make_envs(
         settings.env, run.hyperparams, settings.seed + seed, n_envs, env_kwargs, settings.vec_env, training=False
@@ -352,7 +354,7 @@ def _make_callbacks(
     states: ResumeCallback | None,
     stack: ExitStack,
 ) -> list[BaseCallback]:
-    """Make all callbacks, in the order in which they are called: a state is written before anything else happens."""
+    """Make all callbacks, in the order of their calls: resume states are written before later callbacks do anything."""
     settings, hyperparams = run.settings, run.hyperparams
     progress = ProgressCallback(bool(settings.progress), settings.verbose)
     stack.callback(progress.close)
@@ -415,12 +417,12 @@ def _make_evaluation(
 
 
 def _calls(run: TrainingRun, freq: int) -> int:
-    """Return environment steps as calls of a callback, which is called once for a step of all environments."""
+    """Convert environment steps to calls of a callback, which is called once per step of all environments."""
     return max(freq // run.hyperparams.n_envs, 1)
 
 
 def _remedy(run: TrainingRun) -> str:
-    """Return what to do to continue on one thread."""
+    """Return the instructions for continuing the run on one thread."""
     if run.settings.writes_states:
         return f"press Ctrl-C, then\n  {run.folder.command_to_resume} --num-threads 1"
     return "press Ctrl-C, and add --num-threads 1 to the command that is printed then."

@@ -1,4 +1,4 @@
-"""A run that other processes disturb: its threads wait for each other, and one thread alone would be faster."""
+"""Detection of a busy machine, on which the threads of a run wait for each other and one thread would be faster."""
 
 import time
 from collections.abc import Callable
@@ -9,23 +9,24 @@ from stable_baselines3.common.callbacks import BaseCallback
 # Updates are judged in windows of this much training time. Three in a row outlast a pause and a short burst of load
 _WINDOW_SECONDS = 10.0
 _WINDOWS = 3
-# Threads that wait for each other spin. Alone on the machine they get more than 0.95 of the time of as many cores; an
-# update burns 1.0 to 1.6 times what the fastest can have burnt; next to one or two busy processes they get 0.5 to 0.65,
-# and an update burns 3.3 to 5 times as much. Both limits together: updates take at least 3 times as long as the fastest
+# Threads that wait for each other spin. Alone on the machine, they get more than 0.95 of the time of as many cores, and
+# an update uses 1.0 to 1.6 times the processor time that the fastest can have used. With one or two other busy
+# processes, they get 0.5 to 0.65, and an update uses 3.3 to 5 times as much. If both limits are exceeded, updates take
+# at least 3 times as long as the fastest
 _SHARE = 0.75
 _WASTE = 2.25
 
 
 class BusyMachineCallback(BaseCallback):
     """
-    Say once that updates have become several times slower because threads of this run wait for each other.
+    A callback that says once that updates are several times slower because the threads of this run wait for each other.
 
-    What passes from the end of a rollout to the start of the next counts: this comes before callbacks that take their
-    time there. The fastest update is the measure. If the machine is busy from the start there is one too, as some
-    updates fit between two interruptions, but not where a single call of ``train`` makes many.
+    An update is timed from the end of a rollout to the start of the next, so this callback must come before those that
+    take time at these points. Updates are compared with the fastest. Even if the machine is busy from the start, some
+    updates fit between two interruptions and are fast; not so if a single call of ``train`` makes many updates.
 
     :param say: prints a message
-    :param remedy: what to do, at the end of the message
+    :param remedy: advice for the end of the message
     """
 
     is_captured = False

@@ -1,4 +1,4 @@
-"""During training, what :mod:`sb3_tdc.critics` shows of a trained model: from the episodes of evaluations."""
+"""Evaluations during training that also compare TDC's critics with realised returns, as :mod:`sb3_tdc.critics` does."""
 
 import time
 from typing import Any
@@ -10,19 +10,19 @@ from sb3_tdc.critics.figures import make_figure, render
 from sb3_tdc.runs.callbacks.stopping import StoppableEvaluation
 from sb3_tdc.tdc import TDC
 
-# A figure is drawn while all of this stays below this share of the time since training began
+# A figure is drawn only if the recordings and the figure take less than this share of the time since training began
 _SHARE = 0.01
 _SECONDS_OF_FIRST_FIGURE = 2.0
 
 
 class CriticEvaluationCallback(StoppableEvaluation):
     """
-    An evaluation that also holds TDC's critics against the returns of its episodes; of other algorithms, just that.
+    An evaluation that also compares TDC's critics with the returns of its episodes; a plain one for other algorithms.
 
-    Logs what :func:`~sb3_tdc.critics.episodes.summarise` returns as ``eval/...``, the seconds all this has taken since
-    training began as ``time/critics_elapsed``, and, to TensorBoard, ``eval/critics``, a figure, as often as fits in one
-    percent of the time. Plays no step more, and draws no random number. Before the first update, and where a time limit
-    ends episodes before the discount has faded, there is nothing to log.
+    Logs the results of :func:`~sb3_tdc.critics.episodes.summarise` as ``eval/...`` and the seconds that the comparison
+    has taken since training began as ``time/critics_elapsed``. Also writes a figure to TensorBoard, ``eval/critics``,
+    as often as fits in one percent of the time. Plays no additional steps, and draws no random numbers. Logs nothing
+    before the first update, nor where a time limit ends episodes before the discount has faded.
     """
 
     def _init_callback(self) -> None:
@@ -73,7 +73,7 @@ class CriticEvaluationCallback(StoppableEvaluation):
         title = f"Evaluation at step {self.num_timesteps:,}"
         try:
             picture = render(make_figure(episodes, title, self.model.scheduled("lam")))  # type: ignore[attr-defined]
-        except ImportError:  # the numbers are enough
+        except ImportError:  # without matplotlib, the logged numbers must do
             return
         self.logger.record("eval/critics", Image(picture, "HWC"), exclude=("stdout", "log", "json", "csv"))
         self.seconds_per_figure = time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""The finite guards of TDC and MEOW, for the other algorithms: nothing that is not finite is learnt from or saved."""
+"""The guards of TDC and MEOW for other algorithms: values that are not finite are neither learnt from nor saved."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ from sb3_tdc.common.words import first_of
 
 
 class FiniteGuardCallback(BaseCallback):
-    """End training with a ``NonFiniteError`` before a transition that is not finite is stored."""
+    """A callback that raises ``NonFiniteError`` before a transition that is not finite is stored."""
 
     is_captured = False
 
@@ -29,7 +29,7 @@ class FiniteGuardCallback(BaseCallback):
 
 def check_before_saving(model: BaseAlgorithm) -> None:
     """
-    Check the weights of a model whose ``save`` does not check them.
+    Check the weights of a model, if its own ``save`` does not.
 
     :raises NonFiniteError: if a weight is NaN or infinite
     """
@@ -40,9 +40,9 @@ def check_before_saving(model: BaseAlgorithm) -> None:
 @contextmanager
 def divergence_named(model: BaseAlgorithm) -> Iterator[None]:
     """
-    Name the weights that cause an error in this block: PyTorch's distributions do not say that they were given NaN.
+    If this block raises, name the weights that are not finite: PyTorch's distributions do not name NaN as the cause.
 
-    :raises NonFiniteError: if weights are not finite
+    :raises NonFiniteError: if the block raises and weights are not finite
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""TensorBoard's HParams tab."""
+"""A callback that fills TensorBoard's HParams tab."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ class RecordHyperparamsCallback(BaseCallback):
     """
     Write hyperparameters to TensorBoard's HParams tab when training begins.
 
-    :param hyperparams: by name; what is not a number or a text is written as one
+    :param hyperparams: by name; a value that is neither a number nor a string is converted to a string
     """
 
     def __init__(self, hyperparams: dict[str, Any]):
@@ -20,7 +20,7 @@ class RecordHyperparamsCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         metrics: dict[str, float] = {"eval/mean_reward": 0.0, "rollout/ep_rew_mean": 0.0}
-        for output in self.logger.output_formats:  # alone: on a screen SB3 warns of an empty table
+        for output in self.logger.output_formats:  # not by the logger: for a screen, SB3 would warn of an empty table
             if isinstance(output, TensorBoardOutputFormat):
                 output.write({"hparams": HParam(self.hparams, metrics)}, {"hparams": ()}, self.num_timesteps)
 

@@ -1,4 +1,4 @@
-"""How far a run is: a bar on a terminal, rare plain lines elsewhere."""
+"""The progress of a run: a bar on a terminal, occasional plain lines elsewhere."""
 
 import os
 import sys
@@ -11,21 +11,21 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
 from sb3_tdc.common.words import count
 
-# Without evaluations, a line so often
+# For a run without evaluations: an evaluation prints a line itself
 _SECONDS_BETWEEN_LINES = 300.0
 _SECONDS_BETWEEN_BAR_UPDATES = 0.1
-# A run that is resumed right before an evaluation has taken one
+# A run resumed right before an evaluation has taken a single step by then: too few for a rate
 _STEPS_FOR_A_RATE = 50
-_DEFAULT_SIZE = {"ncols": 80, "nrows": 24}  # of a terminal that says 0, as a container's may
+_DEFAULT_SIZE = {"ncols": 80, "nrows": 24}  # for a terminal that reports size 0, as in some containers
 
 
 class ProgressCallback(BaseCallback):
     """
-    Steps, steps per second, time left and the last evaluation.
+    A callback that shows steps, steps per second, time left and the last evaluation.
 
-    :param bar: a bar (needs tqdm) instead of lines
+    :param bar: show a bar (requires tqdm) instead of lines
     :param verbose: 0 for no output
-    :raises ImportError: if there is to be a bar and tqdm is missing, with the command that installs it
+    :raises ImportError: if a bar is wanted and tqdm is missing, with the command that installs it
     """
 
     is_captured = False
@@ -65,7 +65,7 @@ class ProgressCallback(BaseCallback):
         self.close()
 
     def close(self) -> None:
-        """Leave the bar as it is; also called when training is interrupted."""
+        """Close the bar and leave it on the screen; also called when training is interrupted."""
         if self.bar is not None:
             self.bar.update(self.num_timesteps - self.bar.n)
             self.bar.close()
@@ -92,7 +92,7 @@ class ProgressCallback(BaseCallback):
         if self.verbose == 0:
             return
         self.last_shown = time.monotonic()
-        # The callback of an evaluation has counted this step already, this one has not
+        # Called by an evaluation, this callback has not counted the current step yet: self.num_timesteps is too small
         steps = self.model.num_timesteps
         parts = [f"{steps:>9,} steps {100 * steps / self.total_timesteps:5.1f}%"]
         done = steps - self.first_timestep
@@ -103,7 +103,7 @@ class ProgressCallback(BaseCallback):
 
 
 class _Evaluation(BaseCallback):
-    """Tell the progress of every evaluation of the ``EvalCallback`` that holds this."""
+    """A callback for ``callback_after_eval``: shows every evaluation of its ``EvalCallback`` in the progress."""
 
     def __init__(self, progress: ProgressCallback):
         super().__init__()
@@ -116,7 +116,7 @@ class _Evaluation(BaseCallback):
 
 
 def _terminal_has_size() -> bool:
-    """Return whether standard error knows its size, if it is a terminal."""
+    """Return whether standard error reports a size; True if it is not a terminal."""
     try:
         return 0 not in os.get_terminal_size(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):  # no terminal: a file, a pipe, a notebook

@@ -1,4 +1,4 @@
-"""Models saved during training. A full disk does not end training."""
+"""Callbacks that save models during training. A full disk does not end training."""
 
 import warnings
 
@@ -10,7 +10,7 @@ from sb3_tdc.runs.models import DISK_ERRORS, save_model
 
 
 class SaveBestCallback(BaseCallback):
-    """Save a new best model, and the statistics of ``VecNormalize``."""
+    """A callback that saves a new best model, with the statistics of ``VecNormalize``."""
 
     def __init__(self, folder: RunFolder):
         super().__init__()
@@ -25,7 +25,7 @@ class SaveBestCallback(BaseCallback):
 
 
 class SavePeriodicallyCallback(CheckpointCallback):
-    """SB3's callback, with finite weights only."""
+    """SB3's ``CheckpointCallback`` that refuses to save weights that are not finite."""
 
     def _on_step(self) -> bool:
         if self.n_calls % self.save_freq == 0:

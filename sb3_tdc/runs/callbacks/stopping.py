@@ -1,4 +1,4 @@
-"""Ctrl-C and a polite kill: training ends after the step under way, with everything consistent."""
+"""Stopping by Ctrl-C or ``kill``: training ends after the current step, with everything consistent."""
 
 import inspect
 import signal
@@ -18,20 +18,21 @@ from sb3_tdc.common.output import write_from_handler
 from sb3_tdc.envs.processes import STOP_SIGNALS
 from sb3_tdc.resume import ResumeCallback
 
-# How long a rollout may take to its end, where a resume state can be written
+# How long to wait for the end of the rollout, where a resume state can be written
 _PATIENCE_SECONDS = 5.0
-# Who presses Ctrl-C twice takes longer; who signals a process and its group (timeout) does not
+# A user takes longer to press Ctrl-C twice; a program that signals both a process and its group (timeout) does not
 _ONE_SIGNAL_SECONDS = 0.2
 
 
 class StopOnSignalCallback(BaseCallback):
     """
-    As a context, take SIGINT, SIGTERM and SIGHUP; as a callback, end training after one. A second Ctrl-C interrupts.
+    A context that handles SIGINT, SIGTERM and SIGHUP, and a callback that ends training after one of them.
 
-    SIGTERM and SIGHUP may come several times, to the process and to its group: they never cost the state. An exception
-    raised by a handler, anywhere, could leave a step of processes half received or a file half written.
+    A second Ctrl-C raises ``KeyboardInterrupt``. SIGTERM and SIGHUP may arrive several times, for the process and for
+    its group, and never raise, so that the resume state is not lost: an exception raised by a handler at an arbitrary
+    point could leave a step of environment processes half received or a file half written.
 
-    :param states: write one first, when the next rollout starts, if that is soon
+    :param states: write a resume state first, if the next rollout starts within a few seconds
     """
 
     is_captured = False
@@ -45,7 +46,7 @@ class StopOnSignalCallback(BaseCallback):
             states.is_wanted = lambda: self.requested
 
     def __enter__(self) -> "StopOnSignalCallback":
-        if threading.current_thread() is threading.main_thread():  # Python allows handlers there alone
+        if threading.current_thread() is threading.main_thread():  # Python allows handlers only there
             taken = [number for number in STOP_SIGNALS if not _is_ignored_hangup(number)]
             self.previous = {number: signal.signal(number, self._handle) for number in taken}
         else:
@@ -70,19 +71,19 @@ class StopOnSignalCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self.requested and self.states is not None and self.states.last_try == self.model.num_timesteps:
-            self.deadline = 0.0  # it is written, or cannot be
+            self.deadline = 0.0  # the state is written, or could not be
 
     def _on_step(self) -> bool:
         return not self.requested or (self.states is not None and time.monotonic() < self.deadline)
 
 
 def _is_ignored_hangup(number: signal.Signals) -> bool:
-    """Return whether it is the SIGHUP of a process started with ``nohup``."""
+    """Return whether a signal is SIGHUP and ignored, as in a process started with ``nohup``."""
     return number.name == "SIGHUP" and signal.getsignal(number) == signal.SIG_IGN
 
 
 class StoppableEvaluation(EvalCallback):
-    """An ``EvalCallback`` that a signal ends between two steps, also where an episode would never end."""
+    """An ``EvalCallback`` that a signal ends between two steps, so that even an endless episode can be stopped."""
 
     def __init__(self, eval_env: VecEnv, stop: StopOnSignalCallback, **kwargs: Any):
         super().__init__(eval_env, **kwargs)
@@ -99,17 +100,17 @@ class StoppableEvaluation(EvalCallback):
         except _EvaluationStoppedError:
             return False
         except OSError as error:
-            if _is_raised_in(error, evaluate_policy):  # by the environment
+            if _is_raised_in(error, evaluate_policy):  # raised by the environment, not by writing the results
                 raise
             warnings.warn(f"The evaluation of step {self.num_timesteps:,} was not written: {error}", stacklevel=2)
             return True
 
 
 def _is_raised_in(error: Exception, function: Callable) -> bool:
-    """Return whether an exception came out of a call of a function."""
+    """Return whether an exception was raised within a call of a function."""
     code = inspect.unwrap(function).__code__
     return any(frame.f_code is code for frame, _ in traceback.walk_tb(error.__traceback__))
 
 
 class _EvaluationStoppedError(Exception):
-    """Never leaves this module."""
+    """Ends an evaluation after a signal; never leaves this module."""
