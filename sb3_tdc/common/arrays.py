@@ -1,4 +1,4 @@
-"""Arrays in files."""
+"""Reader of ``.npz`` files."""
 
 import zipfile
 from pathlib import Path
@@ -10,13 +10,13 @@ from sb3_tdc.common.words import listed
 
 def read_arrays(path: Path, *names: str) -> list[np.ndarray]:
     """
-    Read arrays of a ``.npz`` file; nothing is unpickled.
+    Read arrays of a ``.npz`` file without unpickling anything.
 
-    :raises ValueError: if it is damaged, or one is missing
+    :raises ValueError: if the file is missing or damaged, or an array is missing
     """
     try:
         with path.open("rb") as file:
-            if not zipfile.is_zipfile(file):  # NumPy would take it for a pickle, and advise to open it as one
+            if not zipfile.is_zipfile(file):  # NumPy would take it for a pickle, and advise opening it as one
                 raise zipfile.BadZipFile
             file.seek(0)
             with np.load(file) as saved:

@@ -1,4 +1,4 @@
-"""One clear sentence for every bad argument: what it is, what it was, what is allowed."""
+"""Checks of arguments, whose errors are one clear sentence: the argument, its value, and what is allowed."""
 
 import difflib
 import math
@@ -9,12 +9,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-# The smallest and the largest number that an argument may be; integers where the smallest is an int
+# The smallest and the largest allowed value of each argument, which must be an integer if the smallest is an int
 Limits = Mapping[str, tuple[float, float]]
 # The smallest number above 0
 ABOVE_ZERO = math.nextafter(0.0, 1.0)
 _POSITIVE, _NOT_NEGATIVE = (1, math.inf), (0.0, math.inf)
-# Of the off-policy algorithms of SB3 and their policies
+# Limits of SB3's off-policy algorithms and their policies
 OFF_POLICY_LIMITS: Limits = {
     **dict.fromkeys(("buffer_size", "batch_size", "train_freq", "n_steps", "policy_delay"), _POSITIVE),
     **dict.fromkeys(("target_update_interval", "stats_window_size", "net_arch", "n_critics"), _POSITIVE),
@@ -34,7 +34,7 @@ def _allowed(kind: str, minimum: float, maximum: float) -> str:
 
 
 def _as_number(value: Any) -> float:
-    """Return what ``float()`` makes of a value that is neither a text nor a truth value; NaN if there is no number."""
+    """Convert a value to a float; return NaN for a text, a truth value, or anything else that is not a number."""
     if isinstance(value, (str, bytes, bool, np.bool_)):
         return math.nan
     try:
@@ -60,7 +60,7 @@ def check_integer(name: str, value: Any, minimum: int, maximum: float = math.inf
     """
     Check an integer.
 
-    :return: the value, an integer in [minimum, maximum]; 1e6 is one, too
+    :return: the value, an integer in [minimum, maximum]; a whole float such as 1e6 counts as one
     :raises ValueError: if it is anything else
     """
     is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
@@ -72,10 +72,10 @@ def check_integer(name: str, value: Any, minimum: int, maximum: float = math.inf
 
 def check_within(limits: Limits, name: str, value: Any, shown_as: str = "") -> float:
     """
-    Check a number against what an argument may be.
+    Check a number against the limits of an argument.
 
-    :param name: of the argument, a key of the limits
-    :param shown_as: the argument in the error, its name by default
+    :param name: name of the argument, a key of the limits
+    :param shown_as: name of the argument in the error; ``name`` by default
     :return: the value, a number or an integer
     :raises ValueError: if it is anything else
     """
@@ -87,7 +87,7 @@ def check_within(limits: Limits, name: str, value: Any, shown_as: str = "") -> f
 
 def check_boolean(name: str, value: Any, or_none: bool = False) -> bool | None:
     """
-    Check a truth value: a text would count as true, whatever it says.
+    Check a truth value, because a text such as "False" would count as true.
 
     :param or_none: whether None is allowed too, and returned
     :return: the value, True or False
@@ -126,9 +126,11 @@ def check_action_space(action_space: spaces.Space) -> None:
 
 def check_observation_space(space: spaces.Space) -> None:
     """
-    Check that SB3's networks can take the observations of a space: they flatten all axes but the first, the batch's.
+    Check that SB3's networks can take the observations of a space.
 
-    :raises ValueError: if a ``Box``, or one within a ``Dict``, has no axis
+    The networks flatten all axes but the first, the batch axis.
+
+    :raises ValueError: if the space, or a part of a ``Dict``, is a ``Box`` without axes
     """
     parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
     for name, part in parts.items():
@@ -139,11 +141,13 @@ def check_observation_space(space: spaces.Space) -> None:
 
 def check_device(name: str, device: str, remedy: str = "") -> None:
     """
-    Check that a device is there, if it is a CPU or a GPU; SB3 would compute on the CPU where there is no GPU.
+    Check that a device exists on this machine, if it is a CPU or a GPU.
 
-    :param name: of the argument, for the error
-    :param remedy: the end of the sentence
-    :raises ValueError: if there is no such device here, naming those that there are
+    Without a GPU, SB3 would compute on the CPU instead.
+
+    :param name: name of the argument, for the error
+    :param remedy: the end of the error's sentence
+    :raises ValueError: if there is no such device; the error lists the devices of this machine
     """
     n_gpus = {"cpu": 1, "cuda": th.cuda.device_count(), "mps": int(th.backends.mps.is_available())}
     try:
@@ -158,13 +162,13 @@ def check_device(name: str, device: str, remedy: str = "") -> None:
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Return ", did you mean ...?", or nothing if no known name is near."""
+    """Return "; did you mean ...?" with the most similar known name, or an empty string if none is similar."""
     by_lower = {str(k).lower(): k for k in known}
     nearest = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
     return f"; did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return what is wrong with a name: it is unknown, the nearest known one, and all of them."""
+    """Return an error message for an unknown name, with the most similar known name and the list of all of them."""
     known = list(known)
     return f"unknown {kind} {name!r}{suggest(name, known)}; known: {', '.join(known)}"

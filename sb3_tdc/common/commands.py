@@ -1,4 +1,4 @@
-"""How the user calls the commands of this package, for messages that name one."""
+"""The commands of this package as the user types them, for messages that name one."""
 
 import shlex
 import sys
@@ -10,8 +10,9 @@ def command(name: str, *arguments: object) -> str:
     Return a command as the user would type it.
 
     :param name: ``train``, ``enjoy``, ...
-    :param arguments: to quote and append
-    :return: ``python train.py …`` for someone who has called one of these scripts, else ``sb3-tdc train …``
+    :param arguments: arguments of the command, which are quoted
+    :return: ``python train.py …``, ``python -m sb3_tdc train …`` or ``sb3-tdc train …``, depending on how this process
+        was started
     """
     program = Path(sys.argv[0])
     script = program.with_name(f"{name}.py")

@@ -1,4 +1,4 @@
-"""Scalars of the training that stay on the device until the logger asks for them."""
+"""Training scalars that stay on the device until the logger reads them."""
 
 import math
 from collections.abc import Mapping
@@ -14,9 +14,10 @@ _MAX_PENDING = 1000
 
 class Diagnostics:
     """
-    Running means of scalar tensors by name. ``add`` never waits for the device; ``fetch`` does, once.
+    Running means of scalar tensors by name.
 
-    ``is_recorded`` says whether the logger has the means; whoever adds values sets it to False.
+    ``fetch`` waits for the device once. ``add`` waits only when so many scalars are pending that it must fetch them.
+    ``is_recorded`` says whether the logger has the means; a caller that adds values sets it to False.
     """
 
     def __init__(self) -> None:
@@ -24,17 +25,17 @@ class Diagnostics:
         self._sums: dict[str, float] = {}
         self._counts: dict[str, int] = {}
         self._last_finite: dict[str, int] = {}
-        self._ended: list[str] = []  # means that begin again with the next value
+        self._ended: list[str] = []  # means that restart with their next value
         self.is_recorded = True
 
     def add(self, update: int, timestep: int, values: Mapping[str, th.Tensor | float]) -> None:
         """
-        Take scalars of one update.
+        Add the scalars of one update.
 
         :param update: count of gradient steps
         :param timestep: count of environment steps
-        :param values: scalars by name: tensors (without gradient) of one device, or numbers
-        :raises NonFiniteError: if a pending value turned out to be NaN or infinite
+        :param values: scalars by name: tensors (without gradient) on one device, or numbers
+        :raises NonFiniteError: if the pending values are fetched, and one is NaN or infinite
         """
         self._pending += [(name, update, timestep, value) for name, value in values.items()]
         if len(self._pending) >= _MAX_PENDING:
@@ -44,20 +45,21 @@ class Diagnostics:
         """
         Fetch the means from the device.
 
-        :return: the mean of every scalar since the last :meth:`restart`; if it had no value since, the mean before
-        :raises NonFiniteError: if one is NaN or infinite, with the update at which it was first seen
+        :return: the mean of every scalar since the last :meth:`restart`; of a scalar without a value since then, the
+            mean from before it
+        :raises NonFiniteError: if a scalar is NaN or infinite; the error names the first such update
         """
         self._collect()
         return {name: self._sums[name] / self._counts[name] for name in self._sums}
 
     def restart(self) -> None:
-        """Begin every mean again."""
+        """Restart every mean at its next value."""
         self._collect()
         self._ended = list(self._sums)
 
     def record(self, logger: Logger) -> None:
         """
-        Leave the means in a logger, as ``train/...``.
+        Record the means in a logger as ``train/...``.
 
         :raises NonFiniteError: as :meth:`fetch`
         """
@@ -70,7 +72,7 @@ class Diagnostics:
             return
         pending, self._pending = self._pending, []
         tensors = [value for *_, value in pending if isinstance(value, th.Tensor)]
-        fetched = iter(th.stack(tensors).tolist() if tensors else [])  # the one wait for the device
+        fetched = iter(th.stack(tensors).tolist() if tensors else [])  # the only wait for the device
         for name, update, timestep, value in pending:
             number = next(fetched) if isinstance(value, th.Tensor) else value
             if not math.isfinite(number):

@@ -1,4 +1,4 @@
-"""Files that are never half written, folders that no two processes share."""
+"""Helpers for files that are never half written, and for folders that no two processes share."""
 
 import os
 import re
@@ -9,9 +9,10 @@ from typing import Any
 
 def write_atomically(write: Callable[[Path], Any], path: Path) -> None:
     """
-    Write a file next to its place, then rename it: a file that is already there stays whole until the new one is.
+    Write a file next to its final path, then rename it: an existing file stays whole until the new one is complete.
 
-    :param write: takes the path to write to, which has the same suffix
+    :param write: function that writes the file to the path that it is given, which has the same suffix
+    :param path: the final path
     """
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
@@ -23,10 +24,10 @@ def write_atomically(write: Callable[[Path], Any], path: Path) -> None:
 
 def check_writable(flag: str, path: Path) -> None:
     """
-    Make the folder of a file that will be written.
+    Check that a file can be written, and create its folder.
 
-    :param flag: that named the file, for the error
-    :raises ValueError: if it cannot be written
+    :param flag: command-line flag that named the file, for the error
+    :raises ValueError: if the file cannot be written
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,10 +42,10 @@ def check_writable(flag: str, path: Path) -> None:
 
 def check_can_be_made(flag: str, folder: Path) -> None:
     """
-    Check that files can be made in a folder, or the folder in the nearest one that exists; nothing is made.
+    Check that a folder can be written to or, if it does not exist, can be created; nothing is created.
 
-    :param flag: that named the folder, for the error
-    :raises ValueError: if they cannot
+    :param flag: command-line flag that named the folder, for the error
+    :raises ValueError: if the folder, or its nearest parent that exists, cannot be written to
     """
     nearest = next(path for path in (folder, *folder.parents) if path.exists())
     if not nearest.is_dir():
@@ -54,7 +55,7 @@ def check_can_be_made(flag: str, folder: Path) -> None:
 
 
 def make_numbered(parent: Path, name: str, suffix: str = "") -> Path:
-    """Make the folder ``<name>_<next number>``; two processes that start at once get one each."""
+    """Create the folder ``<name>_<next number>``; two processes that start at the same time get a folder each."""
     number = max(numbered(parent, name), default=0) + 1
     while True:
         path = parent / f"{name}_{number}{suffix}"
@@ -67,7 +68,7 @@ def make_numbered(parent: Path, name: str, suffix: str = "") -> Path:
 
 
 def numbered(parent: Path, name: str) -> dict[int, Path]:
-    """Return the folders ``<name>_<number>``, by number; of several with one number (by UUID), the newest."""
+    """Return the folders ``<name>_<number>`` by number; of those with one number and different UUIDs, the newest."""
     folders = {}
     for path in sorted(parent.glob(f"{name}_*"), key=lambda p: p.stat().st_mtime):
         if path.is_dir() and (match := re.fullmatch(r"_(\d+)(_[0-9a-f-]{36})?", path.name[len(name) :])):
@@ -77,7 +78,7 @@ def numbered(parent: Path, name: str) -> dict[int, Path]:
 
 def lock(path: Path) -> Any:
     """
-    Lock a file, which is made if it does not exist, until it is closed.
+    Lock a file until it is closed; create it if it does not exist.
 
     :return: the open file; None if another process has locked it
     """
@@ -98,7 +99,7 @@ def lock(path: Path) -> Any:
 
 
 def unlock(file: Any) -> None:
-    """Let others lock a file, also where a forked process still has it open."""
+    """Release the lock of a file, even if a forked process still has the file open."""
     try:
         import fcntl
     except ImportError:  # Windows

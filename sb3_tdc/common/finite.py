@@ -1,4 +1,4 @@
-"""What is NaN or infinite, and the error that says so."""
+"""Checks for values that are NaN or infinite, and the error that reports them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,23 +10,23 @@ from torch import nn
 
 from sb3_tdc.common.words import first_of
 
-# The end of a sentence about training that has diverged
+# The end of an error message about training that has diverged
 ADVICE = "Training has stopped. Look for extreme rewards or observations, or lower the learning rates."
 
 
 class NonFiniteError(FloatingPointError):
-    """A loss, an action, a reward or a weight is NaN or infinite; the message says which and since when."""
+    """Error for a NaN or infinite loss, action, reward or weight; the message says which, and since when."""
 
 
 def find_non_finite(network: nn.Module, weights: dict[str, Any]) -> list[str]:
     """
     Find parameters and running statistics that are NaN or infinite.
 
-    A constant may be infinite, for instance the mask of an attention.
+    Constants are not checked: they may be infinite, for instance the mask of an attention layer.
 
-    :param network: whose weights they are; its own are not looked at
-    :param weights: a state dict
-    :return: their names
+    :param network: the network that the weights belong to; the values of its own weights are not checked
+    :param weights: a state dict of the network
+    :return: the names of the parameters and running statistics
     """
     parameters = {name for name, _ in network.named_parameters(remove_duplicate=False)}
     checked = (name for name in weights if name in parameters or "running_" in name)
@@ -44,10 +44,10 @@ def find_non_finite_weights(model: BaseAlgorithm) -> list[str]:
 
 def refuse_non_finite(refusal: str, names: Sequence[str]) -> None:
     """
-    Refuse what is not finite.
+    Raise an error if any values are not finite.
 
     :param refusal: the beginning of the error's sentence, before the names
-    :param names: of what is NaN or infinite; with none, nothing happens
+    :param names: names of the values that are NaN or infinite; if there are none, nothing happens
     :raises NonFiniteError: if there are any
     """
     if names:
@@ -56,9 +56,9 @@ def refuse_non_finite(refusal: str, names: Sequence[str]) -> None:
 
 def refuse_to_save(model: BaseAlgorithm, names: Sequence[str]) -> None:
     """
-    Refuse to save a model.
+    Raise an error if a model cannot be saved because its weights are not finite.
 
-    :param names: of its weights that are NaN or infinite
+    :param names: names of its weights that are NaN or infinite
     :raises NonFiniteError: if there are any
     """
     refuse_non_finite(f"The model of step {model.num_timesteps:,} was not saved: the weights", names)

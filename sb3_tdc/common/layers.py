@@ -1,4 +1,4 @@
-"""Layers that several networks have in parallel."""
+"""Layers that evaluate several networks in parallel."""
 
 import math
 
@@ -8,11 +8,11 @@ from torch import nn
 
 class StackedLinear(nn.Module):
     """
-    One ``nn.Linear`` per network, as a single batched matrix product. Initialised like ``nn.Linear``.
+    One ``nn.Linear`` per network, computed as a single batched matrix product. Initialised like ``nn.Linear``.
 
-    :param n_networks: C, networks in parallel
-    :param in_features: features in
-    :param out_features: features out
+    :param n_networks: C, the number of networks
+    :param in_features: number of input features of each network
+    :param out_features: number of output features of each network
     """
 
     def __init__(self, n_networks: int, in_features: int, out_features: int):
@@ -24,11 +24,11 @@ class StackedLinear(nn.Module):
         nn.init.uniform_(self.bias, -bound, bound)
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """Return (C, B, out) of (B, in), shared by the networks, or of (C, B, in)."""
+        """Return the outputs (C, B, out) for inputs (B, in), which all networks share, or (C, B, in)."""
         return th.baddbmm(self.bias, inputs.expand(len(self.weight), -1, -1), self.weight)
 
     def forward_first(self, inputs: th.Tensor) -> th.Tensor:
-        """Return (B, out) of (B, in), through the first network alone."""
+        """Return the outputs (B, out) of the first network for inputs (B, in)."""
         return th.addmm(self.bias[0], inputs, self.weight[0])
 
     def extra_repr(self) -> str:

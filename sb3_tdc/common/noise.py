@@ -1,4 +1,4 @@
-"""Exploration noise: of many environments drawn at once, perhaps of another size in each, and of any action space."""
+"""Exploration noise for any action space, drawn for all environments at once; its scale may differ between them."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,11 +14,11 @@ class NormalNoiseRange(NormalActionNoise):
     """
     Gaussian noise that is small in the first environment and large in the last, evenly spaced between (as in FastTD3).
 
-    By itself, and so in a single environment, it has the size in the middle.
+    On its own, as in a single environment, the noise has the average of the smallest and largest standard deviation.
 
-    :param mean: (n_actions,)
+    :param mean: (n_actions,), the mean in every environment
     :param smallest: (n_actions,), the standard deviation in the first environment
-    :param largest: the same in the last
+    :param largest: (n_actions,), the standard deviation in the last environment
     """
 
     def __init__(self, mean: np.ndarray, smallest: np.ndarray, largest: np.ndarray):
@@ -31,12 +31,12 @@ class NormalNoiseRange(NormalActionNoise):
 
 class VectorizedNormalNoise(VectorizedActionNoise):
     """
-    SB3's ``VectorizedActionNoise`` of Gaussian noise with one draw for all environments: the same numbers, sooner.
+    Gaussian ``VectorizedActionNoise`` that draws once for all environments: the same numbers as SB3's, but faster.
 
     ``mean`` and ``sigma``, (n_envs, *actions), may be changed in place.
 
-    :param base_noise: of one environment
-    :param n_envs: how many there are
+    :param base_noise: noise of one environment
+    :param n_envs: number of environments
     """
 
     def __init__(self, base_noise: NormalActionNoise, n_envs: int):
@@ -52,11 +52,11 @@ class VectorizedNormalNoise(VectorizedActionNoise):
         return np.random.normal(self.mean, self.sigma).astype(dtype)
 
     def reset(self, indices: Iterable[int] | None = None) -> None:
-        """Do nothing: what is drawn does not depend on what was drawn before."""
+        """Do nothing: each draw is independent of those before."""
 
     @property  # type: ignore[override]
     def noises(self) -> "tuple[_NoiseOfOne, ...]":
-        """Return the noise of every environment: what is changed of it changes ``mean`` and ``sigma``."""
+        """Return the noise of every environment, as views: changing one changes ``mean`` and ``sigma``."""
         return tuple(_NoiseOfOne(self, i) for i in range(self.n_envs))
 
     @noises.setter  # type: ignore[override]
@@ -70,7 +70,7 @@ class VectorizedNormalNoise(VectorizedActionNoise):
 
 
 class _NoiseOfOne(NormalActionNoise):
-    """The noise of one of several environments: a view of their ``mean`` and ``sigma``."""
+    """The noise of one of several environments: a view of its ``mean`` and ``sigma``."""
 
     def __init__(self, noise: VectorizedNormalNoise, index: int):
         self.noise, self.index = noise, index
@@ -94,9 +94,9 @@ class _NoiseOfOne(NormalActionNoise):
 
 
 def noise_of_all(noise: ActionNoise, n_envs: int) -> ActionNoise:
-    """Return the noise of several environments, made of that of one."""
+    """Return noise for several environments, made from the noise of one; for one environment, the noise itself."""
     if n_envs > 1:
-        # A subclass may draw otherwise
+        # A subclass may draw differently
         if isinstance(noise, NormalActionNoise) and type(noise) in (NormalActionNoise, NormalNoiseRange):
             return VectorizedNormalNoise(noise, n_envs)
         return VectorizedActionNoise(noise, n_envs)
@@ -104,7 +104,11 @@ def noise_of_all(noise: ActionNoise, n_envs: int) -> ActionNoise:
 
 
 def _of_every_action(noise: ActionNoise, shape: tuple[int, ...]) -> ActionNoise:
-    """Return noise given by two numbers as that of actions of a shape: NumPy would draw one number for all of them."""
+    """
+    Expand Gaussian noise with a scalar mean and standard deviation to all actions; return other noise unchanged.
+
+    NumPy would otherwise draw one number for all actions.
+    """
     one: Any = noise.base_noise if isinstance(noise, VectorizedActionNoise) else noise
     if type(one) is not NormalActionNoise or np.ndim(one._mu) > 0 or np.ndim(one._sigma) > 0:
         return noise
@@ -112,14 +116,14 @@ def _of_every_action(noise: ActionNoise, shape: tuple[int, ...]) -> ActionNoise:
 
 
 class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
-    """An off-policy algorithm whose ``action_noise`` may be a number, and fits any actions and environments."""
+    """Off-policy algorithm whose ``action_noise`` may be a number, and is adapted to the actions and environments."""
 
     @property
     def action_noise(self) -> ActionNoise | None:
         """
         Return the exploration noise.
 
-        A number put here becomes Gaussian noise, and noise of one environment that of all.
+        An assigned number becomes Gaussian noise. Assigned noise of one environment becomes noise of all environments.
         """
         try:
             return vars(self)["action_noise"]
@@ -131,7 +135,7 @@ class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
         n_envs, action_space = vars(self).get("n_envs", 1), vars(self).get("action_space")
         if noise is not None and not isinstance(noise, ActionNoise):
             sigma = check_number("action_noise (if not an ActionNoise or None)", noise, 0.0)
-            if action_space is not None:  # without one, a saved model is being loaded
+            if action_space is not None:  # without a space, a saved model is being loaded
                 noise = NormalActionNoise(np.zeros(()), np.full((), sigma))
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != n_envs:
             noise = noise.base_noise
@@ -142,7 +146,7 @@ class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
         vars(self)["action_noise"] = noise
 
     def _setup_model(self) -> None:
-        self.action_noise = self.action_noise  # a saved model's, for the environments of this one
+        self.action_noise = self.action_noise  # the setter adapts a saved model's noise to the environments of this one
         super()._setup_model()
 
     def _sample_action(
@@ -151,7 +155,7 @@ class NoisyOffPolicyAlgorithm(OffPolicyAlgorithm):
         scaled_action = self._sample_scaled_action(learning_starts, n_envs)
         if action_noise is not None:
             noise = action_noise()
-            if not self.action_space.shape:  # or (n,) and (n, 1) would be added to (n, n)
+            if not self.action_space.shape:  # otherwise (n,) and (n, 1) would broadcast to (n, n)
                 noise = noise.reshape(scaled_action.shape)
             scaled_action = np.clip(scaled_action + noise, -1, 1)
         return self.policy.unscale_action(scaled_action), scaled_action

@@ -1,4 +1,4 @@
-"""What the off-policy algorithms of this package share: checked arguments, schedules, a log, finite guards."""
+"""Shared base of this package's off-policy algorithms: checked arguments, schedules, a log, guards against NaN."""
 
 import io
 import pathlib
@@ -26,32 +26,32 @@ from sb3_tdc.common.noise import NoisyOffPolicyAlgorithm
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.transitions import check_first_observation, check_transition
 
-# A schedule that ends at 0, as SB3's LinearSchedule, may be below it by the rounding of its arithmetic
+# A schedule that ends at 0, such as SB3's LinearSchedule, may fall below 0 by a rounding error
 _ROUNDING = 1e-12
 
 
 def discounts_of(replay_data: ReplayBufferSamples, gamma: float) -> th.Tensor | float:
     """
-    Return the discounts of what follows the rewards of a minibatch.
+    Return the discounts of the values that follow the rewards of a minibatch.
 
     :param gamma: γ
-    :return: (B, 1) where the minibatch has its own, as that of n-step returns has; otherwise γ
+    :return: (B, 1) if the minibatch has discounts, as one of n-step returns does; otherwise γ
     """
     return gamma if replay_data.discounts is None else replay_data.discounts
 
 
 class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     """
-    An off-policy algorithm whose arguments are checked, and which neither learns from nor saves what is not finite.
+    Off-policy algorithm that checks its arguments, and neither learns from nor saves values that are not finite.
 
-    A subclass calls ``diagnose`` at its updates and ``_record_training`` after them, and declares
+    A subclass calls ``diagnose`` in its updates and ``_record_training`` after them, and declares
 
-    - in ``limits``, which numbers its arguments may be,
-    - in ``schedules``, its arguments that may be schedules,
-    - in ``saved_fields``, what its saved models hold in addition to SB3's own fields,
-    - in ``captured_attributes``, what a resumed run needs of that which saved models leave out,
-    - in ``changeable``, its arguments that may be changed when a run is resumed,
-    - in ``color``, how figures draw it.
+    - in ``limits``, the allowed values of its numeric arguments,
+    - in ``schedules``, the arguments that may be schedules,
+    - in ``saved_fields``, the fields that its saved models hold in addition to SB3's own,
+    - in ``captured_attributes``, the attributes that a resumed run needs although saved models leave them out,
+    - in ``changeable``, the arguments that may be changed when a run is resumed,
+    - in ``color``, its colour in figures.
     """
 
     limits: ClassVar[Limits] = OFF_POLICY_LIMITS
@@ -67,12 +67,12 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         given, kwargs = self.replay_buffer_class, self.replay_buffer_kwargs
         self.replay_buffer_kwargs = dict(kwargs)
         super()._setup_model()
-        # What SB3 chose, with n and γ, is not saved: a model may be loaded with others
+        # The buffer class that SB3 chose, and its n and γ, are not saved: a model may be loaded with other values
         self._chose_replay_buffer, self.replay_buffer_kwargs = given is None, kwargs
         self._diagnostics = Diagnostics()
 
     def _pass_gamma_to_replay_buffer(self) -> None:
-        """Let a replay buffer of n-step returns discount by γ as it is now."""
+        """Set the discount of an n-step replay buffer that SB3 chose to the current γ."""
         if self._chose_replay_buffer and isinstance(self.replay_buffer, NStepReplayBuffer):
             self.replay_buffer.gamma = self.gamma
 
@@ -101,16 +101,16 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
             value = self._current_lr_schedule()
         if not callable(value):
             return check_number(name, value, 0.0)
-        # A run overshoots its end by the rest of its last rollout; a schedule is for a progress between 1 and 0
+        # A run overshoots its end by the rest of its last rollout, but a schedule expects a progress between 1 and 0
         progress = max(self._current_progress_remaining, 0.0) if progress_remaining is None else progress_remaining
         described = f"{name} (a schedule, at progress remaining {progress:.4g})"
         number = check_number(described, value(progress))
         return 0.0 if -_ROUNDING < number < 0 else check_number(described, number, 0.0)
 
     def _current_lr_schedule(self) -> Schedule:
-        """Return SB3's ``lr_schedule``, made again from ``learning_rate`` where that has been changed since."""
+        """Return SB3's ``lr_schedule``, after recreating it if ``learning_rate`` has been changed."""
         if self.learning_rate is not self._scheduled_learning_rate:
-            self.scheduled("learning_rate", progress_remaining=1.0)  # checks it
+            self.scheduled("learning_rate", progress_remaining=1.0)  # checks the new value
             self._setup_lr_schedule()
         return self.lr_schedule
 
@@ -121,11 +121,11 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     # ---------------------------------------------------------------- logging
 
     def diagnose(self, **values: th.Tensor | float) -> None:
-        """Take scalars of this update into the means of the log; nothing waits for the device."""
+        """Add scalars of this update to the means in the log, without fetching each from the device."""
         self._diagnostics.add(self._n_updates, self.num_timesteps, values)
 
     def _record_training(self) -> None:
-        """Leave in the logger what callbacks read there after ``train()``, as with every algorithm of SB3."""
+        """Record the values that callbacks read from the logger after ``train()``, as every algorithm of SB3 does."""
         logger = vars(self).get("_logger")
         if logger is None:
             return
@@ -138,13 +138,13 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
 
     @property
     def logger(self) -> Logger:
-        """Return SB3's logger; what was measured in training is fetched from the device when the logger is read."""
+        """Return SB3's logger, after recording training scalars that are still on the device."""
         if not self._diagnostics.is_recorded:
             self._diagnostics.record(self._logger)
         return self._logger
 
     def dump_logs(self) -> None:
-        """Write log data; the means of the training begin again."""
+        """Write the log, and restart the means of the training scalars."""
         super().dump_logs()
         self._diagnostics.restart()
 
@@ -162,7 +162,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         try:
             check_transition(self, buffer_action, new_obs, reward, dones, infos)
         except NonFiniteError:
-            self._diagnostics.fetch()  # if it was a loss that diverged, say that instead
+            self._diagnostics.fetch()  # if a loss has diverged, raises that error instead
             raise
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
@@ -187,7 +187,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
         :param path: path to the file where the rl agent should be saved
         :param exclude: name of parameters that should be excluded in addition to the default ones
         :param include: name of parameters that might be excluded but should be included anyway
-        :raises NonFiniteError: if a weight is NaN or infinite; a file that is there already stays as it is
+        :raises NonFiniteError: if a weight is NaN or infinite; an existing file stays unchanged
         """
         refuse_to_save(self, self._non_finite_weights())
         super().save(path, exclude, include)
@@ -200,7 +200,7 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     # ---------------------------------------------------------------- resuming
 
     def forget_episodes(self) -> None:
-        """Forget what a subclass knows of the episodes under way: the environments begin new ones."""
+        """Forget what a subclass has recorded of the current episodes, because the environments begin new ones."""
 
     def prepare_to_continue(self) -> None:
-        """Make what a model makes in its first updates, when a run is resumed after them."""
+        """Create what a model otherwise creates in its first updates, for a run that is resumed after them."""

@@ -1,4 +1,4 @@
-"""What a run prints never ends it: not at a closed pipe or terminal, on a full disk, or where a letter is missing."""
+"""Output that never ends a run: not at a closed pipe or terminal, on a full disk, or with a missing character."""
 
 import os
 import sys
@@ -13,7 +13,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 class _HarmlessStream:
     """
-    A text stream that drops what cannot be written, and replaces letters that it cannot encode.
+    Text stream that drops text that it cannot write, and replaces characters that it cannot encode.
 
     :param stream: standard output or standard error
     """
@@ -27,7 +27,7 @@ class _HarmlessStream:
         except UnicodeEncodeError:
             encoding = self._stream.encoding
             self.write(text.encode(encoding, errors="replace").decode(encoding))
-        except (OSError, ValueError):  # a ValueError if it was closed
+        except (OSError, ValueError):  # ValueError: the stream is closed
             pass
         return len(text)
 
@@ -58,7 +58,11 @@ def warnings_as_sentences() -> Iterator[None]:
 
 @contextmanager
 def harmless_output() -> Iterator[None]:
-    """Let nothing that is printed in this block raise, and nothing that is left of it at the exit of the process."""
+    """
+    Keep printing in this block from raising errors.
+
+    Output that cannot be flushed at the end of the block raises no error when the process exits, either.
+    """
     streams = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (stream and _HarmlessStream(stream) for stream in streams)  # None if closed from the start
     try:
@@ -74,11 +78,11 @@ def _drop_what_cannot_be_flushed(stream: Any) -> None:
         if stream is not None:
             stream.flush()
     except (OSError, ValueError):
-        with suppress(OSError, ValueError):  # Python flushes once more when it exits, and would fail then
+        with suppress(OSError, ValueError):  # Python flushes again at exit, and would fail then
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def write_from_handler(text: str) -> None:
-    """Write to standard error from the handler of a signal, which may have interrupted a write there."""
+    """Write to standard error from a signal handler, which may have interrupted another write to it."""
     with suppress(OSError):
         os.write(2, text.encode("ascii", errors="replace"))

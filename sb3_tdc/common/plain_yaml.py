@@ -1,8 +1,8 @@
 """
-YAML and RL Zoo's Python notation → plain values, and back. Every file and argument is read here; nothing is evaluated.
+Conversion of YAML and RL Zoo's Python notation to plain values, and of plain values to YAML.
 
-Numbers are those of YAML 1.2: ``1e-3`` is a number, also inside a list or a mapping (PyYAML reads YAML 1.1, where it
-is a text).
+Every file and argument is read here; nothing is evaluated. Numbers follow YAML 1.2: ``1e-3`` is a number, also inside a
+list or a mapping (PyYAML reads YAML 1.1, where it is a text).
 """
 
 import ast
@@ -30,7 +30,7 @@ def _resolvers(base: Any) -> dict[str, Any]:
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain values, and the ordered mappings and tuples in RL Zoo's run folders; no key twice in one mapping."""
+    """Loader of plain values, and of ordered mappings and tuples in RL Zoo's run folders. It refuses repeated keys."""
 
     yaml_implicit_resolvers = _resolvers(yaml.SafeLoader)
 
@@ -46,7 +46,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the texts that the loader would take for numbers; writes what is shared twice."""
+    """Dumper that quotes texts which the loader would take for numbers, and writes shared values in full each time."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -69,7 +69,7 @@ _Loader.add_constructor(f"{_PYTHON}/tuple", _construct_sequence)
 
 
 class _UntrustedLoader(_Loader):
-    """Nothing that makes much of little: no aliases, no merges."""
+    """Loader that refuses aliases and merges, by which a few lines can stand for billions of values."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -86,8 +86,9 @@ def load(text: str, where: str, is_trusted: bool = True) -> Any:
     Read a YAML document of plain values.
 
     :param where: the file or the argument, for the error
-    :param is_trusted: whether it may have aliases and merges, by which a few lines can stand for billions of values
-    :raises ValueError: if it is not one
+    :param is_trusted: whether the document may have aliases and merges, by which a few lines can stand for billions of
+        values
+    :raises ValueError: if the text is not such a document
     """
     try:
         return yaml.load(text, _Loader if is_trusted else _UntrustedLoader)
@@ -97,9 +98,9 @@ def load(text: str, where: str, is_trusted: bool = True) -> Any:
 
 def dump(value: Any, **options: Any) -> str:
     """
-    Write plain values so that :func:`load` gives them back.
+    Write plain values as YAML that :func:`load` reads back.
 
-    :param options: of ``yaml.dump``
+    :param options: keyword arguments of ``yaml.dump``
     """
     return yaml.dump(value, Dumper=_Dumper, **options)
 
@@ -108,7 +109,7 @@ def read_notation(text: str) -> Any:
     """
     Read RL Zoo's Python notation: literals, ``dict(key=value)``, and dotted names, which stay texts (``nn.ReLU``).
 
-    :raises ValueError: for anything else
+    :raises ValueError: if the text is anything else
     """
     try:
         return _literal(ast.parse(text.strip(), mode="eval").body)

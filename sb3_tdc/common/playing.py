@@ -1,4 +1,4 @@
-"""Play a model in an environment."""
+"""Steps and episodes of a model that is played in an environment."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 class Step(NamedTuple):
     """
-    One step of play.
+    One step of a model in an environment.
 
-    :param observation: the one that the model acted on, with a batch axis of 1
+    :param observation: the observation that the model acted on, with a batch axis of 1
     :param action: (A,)
     """
 
@@ -27,8 +27,8 @@ class PlayedEpisode(NamedTuple):
     """
     A finished episode.
 
-    :param total: its return as the environment gave it, not normalised
-    :param length: in steps
+    :param total: the return: the sum of the environment's own rewards, not normalised
+    :param length: number of steps
     """
 
     total: float
@@ -37,9 +37,9 @@ class PlayedEpisode(NamedTuple):
 
 def play_steps(model: BaseAlgorithm, env: VecEnv, deterministic: bool = True) -> Iterator[Step]:
     """
-    Yield every step of episode after episode, without end.
+    Yield the steps of one episode after another, without end.
 
-    :param env: one environment, which is reset first
+    :param env: a single environment, which is reset first
     """
     observation: Any = env.reset()
     while True:
@@ -55,8 +55,8 @@ def play_episodes(
     """
     Yield every finished episode.
 
-    :param env: one environment, under a ``Monitor``
-    :param n_timesteps: stop after this many steps; None for no end
+    :param env: a single environment, wrapped in a ``Monitor``
+    :param n_timesteps: number of steps to stop after; None to play without end
     """
     if n_timesteps is not None and n_timesteps < 1:
         return

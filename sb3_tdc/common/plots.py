@@ -1,4 +1,4 @@
-"""What every plot of this package looks like."""
+"""The common style of this package's plots."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ _LINES_INSIDE = 2
 
 def import_figure() -> Any:
     """
-    Return matplotlib's class of figures.
+    Return matplotlib's ``Figure`` class.
 
-    :raises ImportError: with the command that installs it
+    :raises ImportError: if matplotlib is not installed; the error gives the command that installs it
     """
     try:
         from matplotlib.figure import Figure
@@ -20,10 +20,10 @@ def import_figure() -> Any:
 
 def add_legend(axes: Any, outside: str, ncols: int) -> None:
     """
-    Add a legend inside the axes, or next to them where its lines would hide the curves.
+    Add a legend inside the axes, or outside of them if it has so many lines that it would hide the curves.
 
-    :param outside: matplotlib's location of a legend of the figure, for instance ``"outside lower left"``
-    :param ncols: of columns there
+    :param outside: matplotlib's location of the outside legend, for instance ``"outside lower left"``
+    :param ncols: number of columns of the outside legend
     """
     handles, _ = axes.get_legend_handles_labels()
     if len(handles) <= _LINES_INSIDE:
@@ -33,7 +33,7 @@ def add_legend(axes: Any, outside: str, ncols: int) -> None:
 
 
 def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
-    """Set the texts of axes, and take away what is not needed."""
+    """Set the title and the labels of axes, hide the top and right spines, and draw a faint grid."""
     axes.set_title(title, loc="left", fontweight="bold")
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
@@ -42,7 +42,7 @@ def style_axes(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
 
 
 def short_number(number: float, _: int = 0) -> str:
-    """Return "300k" for 300,000, and "1.5M" for 1,500,000: a formatter of an axis."""
+    """Format a number for the ticks of an axis: "300k" for 300,000, and "1.5M" for 1,500,000."""
     for size, unit in ((1e6, "M"), (1e3, "k")):
         if abs(number) >= size:
             return f"{number / size:g}{unit}"

@@ -1,5 +1,5 @@
 """
-What an algorithm declares of its fields in a saved model: what each may be.
+Declarations of the fields that an algorithm saves, with a check of the values that each may have.
 
 A check takes the name of a field and a value from an untrusted file; it returns the value, or raises a ``ValueError``.
 """
@@ -17,7 +17,8 @@ class SavedField(NamedTuple):
     """
     A field of a saved model.
 
-    :param is_required: whether every file has it, so that no default is taken for it in silence
+    :param check: check of the field's value
+    :param is_required: whether a file without the field is refused, so that no default silently replaces it
     """
 
     check: Check
@@ -38,7 +39,7 @@ def integer(minimum: int, maximum: int = 2**62) -> Callable[[str, Any], int]:
 def number(
     minimum: float = -math.inf, maximum: float = math.inf, above: float = -math.inf
 ) -> Callable[[str, Any], float]:
-    """Return a check that accepts finite numbers in a range, and above ``above``."""
+    """Return a check that accepts finite numbers that are in a range and greater than ``above``."""
 
     def check(name: str, value: Any) -> float:
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
@@ -53,7 +54,7 @@ def number(
 
 def boolean(name: str, value: Any) -> bool:
     """
-    Take True or False alone.
+    Check that a value is True or False.
 
     :return: the value
     :raises ValueError: if it is anything else
@@ -64,21 +65,21 @@ def boolean(name: str, value: Any) -> bool:
 
 
 def schedule(name: str, value: Any) -> Any:
-    """Take a schedule, or a number of at least 0."""
+    """Check that a value is a schedule, or a number of at least 0."""
     return value if callable(value) and not isinstance(value, type) else number(0.0)(name, value)
 
 
 def text_or_number(name: str, value: Any) -> Any:
-    """Take a short text, or a number."""
+    """Check that a value is a short text or a number."""
     return value if isinstance(value, str) and len(value) < 100 else number()(name, value)
 
 
 def none(name: str, value: Any) -> None:
-    """Take None alone."""
+    """Check that a value is None."""
     if value is not None:
         raise ValueError(f"{name} must be null, got {shown(value)}")
 
 
 def or_none(check: Check) -> Check:
-    """Return a check that also takes None."""
+    """Return a check that also accepts None."""
     return lambda name, value: None if value is None else check(name, value)

@@ -1,13 +1,13 @@
-"""What a constructor takes, including what it passes on."""
+"""The parameters of a constructor, including those that it passes on."""
 
 import inspect
 
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
     """
-    Return the named parameters of a constructor, including those it passes on by ``**kwargs``.
+    Return the named parameters of a constructor, including those that it passes on as ``**kwargs``.
 
-    :return: by name, ``self`` included; those of a base class come first
+    :return: the parameters by name, including ``self``; those of a base class come first
     """
     found: dict[str, inspect.Parameter] = {}
     for base in cls.__mro__:

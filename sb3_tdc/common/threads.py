@@ -1,4 +1,4 @@
-"""How many threads PyTorch computes on."""
+"""The number of threads that PyTorch uses."""
 
 import os
 
@@ -6,7 +6,7 @@ import torch as th
 
 
 def set_threads(number: int) -> None:
-    """Set the threads of PyTorch; -1: at most two, unless ``OMP_NUM_THREADS`` says otherwise."""
+    """Set the number of threads of PyTorch; -1 stands for at most two, unless ``OMP_NUM_THREADS`` sets the number."""
     if number > 0:
         th.set_num_threads(number)
     elif "OMP_NUM_THREADS" not in os.environ:  # networks of this size gain nothing from more

@@ -1,4 +1,4 @@
-"""No transition that is not finite enters a replay buffer, whichever off-policy algorithm of SB3 collects it."""
+"""Checks that keep non-finite transitions out of the replay buffer of any of SB3's off-policy algorithms."""
 
 import math
 from collections.abc import Iterator
@@ -22,10 +22,10 @@ def check_transition(
     infos: list[dict[str, Any]],
 ) -> None:
     """
-    Check what is about to be stored, as large as it may be in the type it is stored in.
+    Check that a transition is finite before it is stored, and stays finite in the type in which it is stored.
 
-    :param action: in the units of the replay buffer
-    :raises NonFiniteError: if a number is NaN or infinite, or will be
+    :param action: scaled actions, as the replay buffer stores them
+    :raises NonFiniteError: if a number is NaN or infinite, or too large for the type in which it is stored
     """
     for name, value, largest in _parts(model, action, new_obs, reward, dones, infos):
         if not _is_finite(value, largest):
@@ -39,7 +39,7 @@ def check_transition(
 
 def check_first_observation(model: OffPolicyAlgorithm) -> None:
     """
-    Check the observations that training begins with.
+    Check that the observations with which training begins are finite.
 
     :raises NonFiniteError: if a number is NaN or infinite
     """
@@ -63,11 +63,11 @@ def _parts(
     yield "action", action, _LARGEST
     yield "reward", reward, _LARGEST
     yield from _observations(model, new_obs)
-    if normalization is not None:  # what is stored
+    if normalization is not None:  # these values are stored
         yield "reward", normalization.get_original_reward(), _LARGEST
         yield from _observations(model, normalization.get_original_obs())
     for info, done in zip(infos, dones, strict=True):
-        last = info.get("terminal_observation") if done else None  # new_obs is the first of the next episode already
+        last = info.get("terminal_observation") if done else None  # new_obs already belongs to the next episode
         if last is not None:
             if normalization is not None:
                 last = normalization.unnormalize_obs(last)

@@ -1,10 +1,10 @@
-"""How values of untrusted files are shown in messages."""
+"""Safe display of values of untrusted files in messages."""
 
 from typing import Any
 
 
 def shown(value: Any) -> str:
-    """Return a short text for a value of a file: at most its first letters, and nothing that drives a terminal."""
+    """Return a short text for a value of a file: at most 60 characters of a string, and no control characters."""
     if isinstance(value, bool | float | None):
         return str(value)
     if isinstance(value, int):
@@ -17,5 +17,5 @@ def shown(value: Any) -> str:
 
 
 def escaped(text: str, length: int = 300) -> str:
-    """Return a text in printable letters: control characters as escapes, and not more than ``length`` of them."""
+    """Return the first ``length`` characters of a text, with escapes for those that are not printable."""
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text[:length])

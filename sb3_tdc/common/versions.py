@@ -1,4 +1,4 @@
-"""What a result depends on in addition to its seed: versions, the commit, the processor."""
+"""The versions, commit and processor that a result depends on in addition to its seed."""
 
 import platform
 import re
@@ -24,11 +24,11 @@ def numba_version() -> str | None:
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions of everything that computes; PyBullet's where it is installed."""
+    """Return the versions of Python and of the libraries that compute; PyBullet's only if it is installed."""
     pybullet = _installed("pybullet")
     return {
         "python": platform.python_version(),
-        "torch": str(th.__version__),  # otherwise a class of PyTorch's
+        "torch": str(th.__version__),  # a plain string, not PyTorch's subclass of it
         "numpy": np.__version__,
         "stable_baselines3": stable_baselines3.__version__,
         "gymnasium": gym.__version__,
@@ -46,14 +46,14 @@ def _installed(package: str) -> str:
 
 
 def processor_name() -> str:
-    """Return the name that the processor gives itself, or what Python knows of it."""
+    """Return the model name of the processor, or what Python reports where Linux's ``/proc/cpuinfo`` has none."""
     cpuinfo = Path("/proc/cpuinfo")
     found = re.search(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.is_file() else None
     return found[1] if found else platform.processor()
 
 
 def commit_of_the_code() -> str:
-    """Return the commit of the clone that this package lies in, and whether files differ from it; "" for a wheel."""
+    """Return the commit of the clone that contains this package, and whether files differ from it; "" for a wheel."""
     root = Path(__file__).resolve().parents[2]
     try:
         commit = _git(root, "rev-parse", "HEAD")
@@ -63,6 +63,6 @@ def commit_of_the_code() -> str:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    if not (root / ".git").exists():  # installed, perhaps below a repository of something else
+    if not (root / ".git").exists():  # an installed package, perhaps inside another repository
         raise FileNotFoundError(root / ".git")
     return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,4 +1,4 @@
-"""Numbers and lists in sentences."""
+"""Helpers for numbers and lists in sentences."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ def count(n: int, noun: str) -> str:
 
 
 def counted(numbers: Sequence[int], noun: str) -> str:
-    """Return "1 and 5 seeds" for ``counted([1, 5], "seed")``; ``numbers`` must not be empty, and rise."""
+    """Return "1 and 5 seeds" for ``counted([1, 5], "seed")``; ``numbers`` must be ascending and not empty."""
     *others, largest = numbers
     return listed([*map(str, others), count(largest, noun)])
 

@@ -1,9 +1,10 @@
 """
-Open untrusted saved models: nothing in the file is imported, called or unpickled.
+Loaders for untrusted saved models: nothing in the file is imported, called or unpickled.
 
-SB3's ``load`` runs whatever a zip asks for, and so do its replay buffers and ``VecNormalize`` files. Here every pickled
-field is read as data, recognised by name and rebuilt from known classes, or refused by name; sizes are bounded before
-anything is decompressed or allocated. What that covers, and what not: docs/safety.md.
+SB3's ``load`` runs any code that a zip names, and so do its loaders of replay buffers and ``VecNormalize`` statistics.
+Here every pickled field is read as data. A field is rebuilt from known classes, or refused with an error that names it.
+Sizes are bounded before anything is decompressed or allocated. docs/safety.md says what this covers, and what it does
+not.
 """
 
 from sb3_tdc.safe_load.budget import UnsafeFileError

@@ -1,4 +1,4 @@
-"""Zip files, bounded before they are read."""
+"""Reader of zip files, which checks their sizes before it reads their entries."""
 
 import io
 import re
@@ -9,8 +9,8 @@ from typing import IO
 from sb3_tdc.common.untrusted import shown
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 
-MAX_BYTES = 2**30  # of a file
-MAX_RATIO = 100  # of decompressed to compressed; SB3 itself does not compress
+MAX_BYTES = 2**30  # size of a file
+MAX_RATIO = 100  # decompressed to compressed bytes of an entry; SB3 itself does not compress
 MAX_DIRECTORY = 2**20  # bytes of a zip's list of entries
 
 MODEL_ENTRIES = re.compile(
@@ -21,13 +21,13 @@ MODEL_ENTRIES = re.compile(
 
 def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget, only: str | None = None) -> dict[str, bytes]:
     """
-    Read the entries of a zip, bounded before they are decompressed.
+    Read the entries of a zip, whose names and sizes are checked before anything is decompressed.
 
-    :param allowed: what entries may be called
-    :param budget: of all that is read from the file
-    :param only: the entry to read; None: all of them
-    :return: the bytes of each entry
-    :raises UnsafeFileError: for other, repeated, encrypted, oversized or suspiciously compressed entries, unread
+    :param allowed: pattern that the names of entries must match
+    :param budget: for everything that is read from the file
+    :param only: name of the entry to read; None to read all entries
+    :return: the bytes of each entry, by name
+    :raises UnsafeFileError: if an entry is unknown, repeated, encrypted, oversized or suspiciously compressed
     """
     if _directory_size(file) > MAX_DIRECTORY:
         raise UnsafeFileError("it is a zip of too many entries")
@@ -48,14 +48,22 @@ def read_archive(file: IO[bytes], allowed: re.Pattern, budget: Budget, only: str
 
 
 def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: Budget) -> bytes:
-    """Read what an entry says that it has: without a size, up to 2 GiB are decompressed before the rest is cut off."""
+    """
+    Read an entry up to its declared size.
+
+    Without a size, ``read`` decompresses up to 2 GiB before it cuts off the excess.
+    """
     budget.check_time()
     with archive.open(entry) as content:
         return content.read(entry.file_size)
 
 
 def _directory_size(file: IO[bytes]) -> int:
-    """Return the size of a zip's list of entries, which ``ZipFile`` would read whole, from the records at its end."""
+    """
+    Return the size of a zip's list of entries in bytes, as declared by the records at the end of the file.
+
+    ``ZipFile`` would read the whole list.
+    """
     size = file.seek(0, io.SEEK_END)
     if size > MAX_BYTES:
         raise UnsafeFileError(f"it has {size:,} bytes, more than {MAX_BYTES:,}")

@@ -1,24 +1,24 @@
-"""What reading one file may cost, all of its parts together."""
+"""Limits on the cost of reading one file, for all of its parts together."""
 
 import time
 
-MAX_OPCODES = 1_000_000  # SB3 writes some thousands for a model
-MAX_NODES = 500_000  # values, each counted as often as it is reached; infos of so many take about all operations
-MAX_SECONDS = 4.0  # beyond what the bytes of a large file take
-BYTES = 2**28  # that a small file may grow to
-GROWTH = 8  # times the size of a large one: entries, copies, arrays
+MAX_OPCODES = 1_000_000  # SB3 writes a few thousand for a model
+MAX_NODES = 500_000  # values, each counted as often as it is reached; infos with that many use about MAX_OPCODES
+MAX_SECONDS = 4.0  # in addition to the time for the bytes of the file
+BYTES = 2**28  # that are granted to every file, however small
+GROWTH = 8  # further bytes for each byte of the file: its entries, copies, arrays
 BYTES_PER_SECOND = 2**25
 
 
 class UnsafeFileError(ValueError):
-    """A file that is not opened, with the reason in one sentence: it asks for more than data, or it is damaged."""
+    """Error for a file that is not opened, with the reason in one sentence: it holds more than data, or is damaged."""
 
 
 class Budget:
     """
-    Made where a file is opened, and handed to everything that reads from it.
+    Budget of one file, created when the file is opened and passed to everything that reads from it.
 
-    :param size: bytes of the file
+    :param size: size of the file in bytes
     """
 
     def __init__(self, size: int):
@@ -28,9 +28,9 @@ class Budget:
 
     def take_opcode(self) -> None:
         """
-        Pay for an operation of a pickle.
+        Pay for one operation of a pickle.
 
-        :raises UnsafeFileError: if a pickle is too long, or takes too much time
+        :raises UnsafeFileError: if the pickles of the file have too many operations, or take too much time
         """
         self.opcodes -= 1
         if self.opcodes < 0:
@@ -42,7 +42,7 @@ class Budget:
         """
         Pay for values.
 
-        :raises UnsafeFileError: if the values would be too many
+        :raises UnsafeFileError: if the file has too many values
         """
         self.nodes -= n
         if self.nodes < 0:
@@ -50,9 +50,9 @@ class Budget:
 
     def take_bytes(self, n: int) -> None:
         """
-        Pay for bytes that are decompressed, copied or made.
+        Pay for bytes before they are decompressed, copied or allocated.
 
-        :raises UnsafeFileError: if what is decompressed, copied and made would be too large
+        :raises UnsafeFileError: if all of these bytes together are too many, or reading has taken too long
         """
         self.bytes -= n
         if self.bytes < 0:
@@ -61,7 +61,7 @@ class Budget:
 
     def check_time(self) -> None:
         """
-        Check the time that reading has taken.
+        Check the time that has been spent on reading the file.
 
         :raises UnsafeFileError: if reading has taken too long
         """

@@ -1,4 +1,4 @@
-"""The fields of a saved model: which there are, what each may be, and what is taken from nowhere but a new model."""
+"""The fields of a saved model: those that are known, their allowed values, and those that are always created anew."""
 
 import base64
 import json
@@ -23,14 +23,14 @@ from sb3_tdc.safe_load.known_objects import CALLS, CLASSES, TAKEN, pickled_name
 from sb3_tdc.safe_load.reading import reading
 from sb3_tdc.safe_load.sb3_fields import OF_SB3, OFF_POLICY
 
-MAX_REPLAY_BYTES = 2**36  # of the replay buffer that a loaded model gets
+MAX_REPLAY_BYTES = 2**36  # size of a loaded model's replay buffer, and of a pickle file
 MAX_HER_SLOTS = 2_000_000
-# What is made of the argument ent_coef
+# Attributes that are created from the argument ent_coef
 TEMPERATURE = ("log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor")
 
 
 def known_policies() -> dict[Any, type[OffPolicyAlgorithm]]:
-    """Return the known policy classes, and the algorithm of each: of TD3 and DDPG, which share them, TD3."""
+    """Return the algorithm of each known policy class; TD3 for the classes that TD3 and DDPG share."""
     algorithms = list(ALGORITHMS.values())
     with suppress(ImportError):  # contrib is an extra
         from sb3_contrib import TQC
@@ -43,7 +43,7 @@ def saved_fields(algorithm: type[OffPolicyAlgorithm]) -> dict[str, SavedField]:
     """
     Return the fields that an algorithm saves, by name; those of ``policy_kwargs`` as ``policy_kwargs.<name>``.
 
-    :param algorithm: it and its bases declare their own in ``saved_fields``
+    :param algorithm: algorithm class; it and its bases declare their own fields in ``saved_fields``
     """
     fields = dict(OFF_POLICY)
     for base in reversed(algorithm.__mro__):
@@ -52,12 +52,12 @@ def saved_fields(algorithm: type[OffPolicyAlgorithm]) -> dict[str, SavedField]:
 
 
 def nearest_algorithm(policy_class: Any) -> type[OffPolicyAlgorithm] | None:
-    """Return the algorithm of a custom policy, which custom_objects gave."""
+    """Return the algorithm of the known policy that a custom policy (of ``custom_objects``) inherits from, or None."""
     bases = policy_class.__mro__ if isinstance(policy_class, type) else ()
     return next((algorithm for base, algorithm in known_policies().items() if base in bases), None)
 
 
-# What is made again when a model is set up or learns; the file's is not looked at
+# Fields that are created again when a model is set up or learns; the file's values are not used
 _MADE_ANEW = {
     "lr_schedule", "start_time", "ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs",
     "_last_episode_starts", "_last_dones", "tensorboard_log", "device", "env", "eval_env",
@@ -73,11 +73,13 @@ def read_fields(
     Read the fields of a saved model.
 
     :param raw: the entry ``data``
-    :param custom_objects: what to take for fields of the file, which are then not looked at
+    :param custom_objects: values by field name that replace those of the file, which are then not used
     :param budget: of the file
-    :param algorithm: whose fields they are to be; None: those of the algorithm of the file's policy
-    :return: the fields that are known, each checked, and the algorithm
-    :raises UnsafeFileError: for any other field, by name, and for another algorithm's file
+    :param algorithm: the algorithm that must have saved the file, or a subclass of it; None for the algorithm of the
+        file's policy
+    :return: the known fields, each checked, and the algorithm
+    :raises UnsafeFileError: if a field is unknown, missing or not allowed (the error names it), or if another algorithm
+        saved the file
     """
     data = parse_data(raw)
     policies = known_policies()
@@ -114,7 +116,7 @@ _REMEDY = re.compile(r"\(custom_objects can \w+ it\)")
 
 
 def on_the_command_line(sentence: str) -> str:
-    """Return a refusal in the words of the command line, where ``custom_objects`` is not a flag."""
+    """Return a refusal that suggests ``--trust`` instead of ``custom_objects``, which is not a flag of the commands."""
     return _REMEDY.sub("(if you know its origin, enjoy, evaluate and train open it with --trust)", sentence)
 
 
@@ -137,7 +139,7 @@ def _check_policy_arguments(arguments: dict[str, Any], policy_class: Any, declar
 
 
 def _pickled(value: Any, budget: Budget, noted: list[Name | Call] | None = None) -> Any:
-    """Return what :func:`read_pickle` makes of a pickled field."""
+    """Read a pickled field with :func:`read_pickle`."""
     text = value[":serialized:"]
     if not isinstance(text, str):
         raise UnsafeFileError("its pickle is not a text")
@@ -150,7 +152,7 @@ def foreign_names(value: Any, budget: Budget) -> list[str]:
     List the code that SB3's ``load`` would run for a field.
 
     :param value: a field of ``data``
-    :return: what SB3's ``load`` would import or call for it that is not known to be harmless, sorted
+    :return: the names that SB3's ``load`` would import or call for it, except those known to be harmless; sorted
     """
     if not (isinstance(value, dict) and ":serialized:" in value):
         return []
@@ -160,7 +162,7 @@ def foreign_names(value: Any, budget: Budget) -> list[str]:
     return code_in(noted, names, {**dict.fromkeys(_HARMLESS, lambda _: True), **TAKEN})
 
 
-# What SB3 and numpy write into fields that are made again, and into attributes that are not looked at
+# Names that SB3 and numpy write into fields that are created again, and into attributes that are not used
 _HARMLESS = {
     *(Name("collections", kind) for kind in ("deque", "defaultdict", "Counter")),
     *(Name("builtins", kind) for kind in ("set", "frozenset", "complex", "bytearray")),
@@ -188,7 +190,7 @@ def _warn_of_code(data: dict[str, Any], custom_objects: dict[str, Any], budget: 
             )
 
 
-# Brackets and commas of JSON: SB3 writes some thousands, most of them inside texts
+# Limit on the brackets and commas of the JSON: SB3 writes a few thousand, most of them inside strings
 _MAX_JSON = 500_000
 
 
@@ -196,7 +198,7 @@ def parse_data(raw: bytes) -> dict[str, Any]:
     """
     Parse the entry ``data``.
 
-    :raises UnsafeFileError: unless it is a mapping of JSON, each key once, of a reasonable number of values
+    :raises UnsafeFileError: unless it is a JSON mapping with unique keys and a reasonable number of values
     """
     with reading("data"):
         if sum(map(raw.count, (b"[", b"{", b","))) > _MAX_JSON:
@@ -214,14 +216,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def is_her(fields: dict[str, Any]) -> bool:
-    """Return whether the model gets a replay buffer with hindsight."""
+    """Return whether the model's replay buffer is a ``HerReplayBuffer``, which replays with hindsight."""
     kind = fields.get("replay_buffer_class")
     return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 
 
 def check_replay_memory(fields: dict[str, Any]) -> None:
     size, observations = fields.get("buffer_size", 1), fields["observation_space"]
-    if is_her(fields) and size > MAX_HER_SLOTS:  # it makes a dict for every one of them
+    if is_her(fields) and size > MAX_HER_SLOTS:  # it allocates a dict for each transition
         raise UnsafeFileError(
             f"its HerReplayBuffer of {size:,} transitions takes more memory than it should: give a smaller buffer_size"
         )

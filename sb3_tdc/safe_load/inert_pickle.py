@@ -1,9 +1,9 @@
 """
-Read a pickle without running it.
+Reader of pickles that does not run them.
 
-What a pickle would import comes back as a :class:`Name`, and what it would call as a :class:`Call`: records, which
-:class:`Rebuild` turns into objects only where the caller knows them. No module is imported, no class is looked up, and
-Python's unpickler is not used.
+It returns a :class:`Name` for each object that a pickle would import, and a :class:`Call` for each call that it would
+make. :class:`Rebuild` turns these records into objects, but only those that the caller knows. No module is imported, no
+class is looked up, and Python's unpickler is not used.
 """
 
 import pickletools
@@ -15,11 +15,11 @@ from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 
 MAX_DEPTH = 64
-MAX_INTEGER_BITS = 128  # numpy's generators have states of that size
+MAX_INTEGER_BITS = 128  # the size of the states of numpy's generators
 
 
 class Name(NamedTuple):
-    """What a pickle would import."""
+    """Record of an object that a pickle would import."""
 
     module: str
     attribute: str
@@ -31,10 +31,10 @@ class Name(NamedTuple):
 @dataclass(eq=False)
 class Call:
     """
-    What a pickle would call, ``function(*args)``, and then do to the result.
+    Record of a call that a pickle would make, ``function(*args)``, and of what it would then do to the result.
 
-    :param state: what it would be set to (``__setstate__``)
-    :param items: what would be appended to it, or set in it as pairs
+    :param state: the state that the result would be set to (``__setstate__``)
+    :param items: the items that would be appended to the result, or the pairs that would be set in it
     """
 
     function: Any
@@ -53,11 +53,12 @@ def read_pickle(data: bytes | IO[bytes], budget: Budget, noted: list[Name | Call
     """
     Read a pickle without importing or calling anything.
 
-    :param data: a pickle of protocol 2 or later, or a file whose ``read(n)`` makes nothing larger than what is left
-    :param budget: of the file that it is in
-    :param noted: gets every name and call, also those that the value does not hold in the end
+    :param data: a pickle of protocol 2 or later, or a file object with one, whose ``read(n)`` must not allocate more
+        bytes than the file has left
+    :param budget: of the file that contains the pickle
+    :param noted: a list that receives every name and call, including those that the returned value does not contain
     :return: numbers, texts, bytes, tuples, lists, dicts and sets of these; :class:`Name`; :class:`Call`
-    :raises UnsafeFileError: if it is damaged, or is more than data, names and calls
+    :raises UnsafeFileError: if the pickle is damaged, or contains more than data, names and calls
     """
     try:
         return _Machine([] if noted is None else noted).run(data, budget)
@@ -68,7 +69,7 @@ def read_pickle(data: bytes | IO[bytes], budget: Budget, noted: list[Name | Call
 
 
 class _Machine:
-    """The pickle machine, in which importing and calling are only noted down. Its operations take their argument."""
+    """Pickle machine that only records imports and calls. Each operation takes the argument of its opcode."""
 
     def __init__(self, noted: list[Name | Call]):
         self.stack: list[Any] = []
@@ -77,7 +78,7 @@ class _Machine:
         self.noted = noted
 
     def run(self, data: bytes | IO[bytes], budget: Budget) -> Any:
-        """Return what the pickle holds."""
+        """Return the value of a pickle."""
         for opcode, argument, _ in pickletools.genops(data):
             budget.take_opcode()
             if opcode.name == "STOP":
@@ -161,7 +162,7 @@ class _Machine:
         items = _checked_elements(self._pop_mark())
         self.stack[-1].update(items)
 
-    # ---------------------------------------------------------------- imports and calls, noted down
+    # ---------------------------------------------------------------- imports and calls, only recorded
 
     def _note(self, part: Name | Call) -> None:
         self.noted.append(part)
@@ -185,7 +186,7 @@ class _Machine:
 
     def build(self, _: None) -> None:
         state = self.stack.pop()
-        if self.stack[-1].state is not None:  # of a Call; anything else has no such attribute
+        if self.stack[-1].state is not None:  # if not a Call, an AttributeError: a damaged pickle
             raise UnsafeFileError("an object that is changed twice")
         self.stack[-1].state = state
 
@@ -204,7 +205,7 @@ def _making_tuple(n: int) -> Callable[[_Machine, None], None]:
     return operation
 
 
-# All that a pickle may do, except STOP
+# All operations that a pickle may contain, except STOP
 _OPERATIONS: dict[str, Callable[[_Machine, Any], None]] = {
     **dict.fromkeys(("PROTO", "FRAME"), _Machine.ignore),
     **dict.fromkeys(("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4"), _Machine.push),
@@ -273,17 +274,18 @@ def _set_items(target: Any, items: list[Any]) -> None:
 
 class Rebuild:
     """
-    Makes objects of what :func:`read_pickle` returned.
+    Builder of objects from the records that :func:`read_pickle` returns.
 
-    :param classes: what a name may stand for
-    :param calls: what a call of a name makes
-    :param budget: of the file. What is shared counts as often as it is reached, so that no text or array made of the
+    :param classes: the class that each known name stands for
+    :param calls: the handler for calls of each known name
+    :param budget: of the file. A shared value counts as often as it is reached, so that no text or array made from the
         result can be much larger than the file
     """
 
     def __init__(self, classes: "Mapping[Name, type]", calls: "Mapping[Name, Handler]", budget: Budget):
         self.classes, self.calls, self.budget = classes, calls, budget
-        self._finished: dict[int, tuple[Any, Any, int]] = {}  # by identity (the part is kept alive): rebuilt once
+        # By id: the part (kept alive, so that no other gets its id), its result, its number of nodes
+        self._finished: dict[int, tuple[Any, Any, int]] = {}
         self._under_way: set[int] = set()
         self._nodes = 0
 
@@ -291,8 +293,8 @@ class Rebuild:
         """
         Rebuild a part of a value.
 
-        :param part: of the value
-        :raises UnsafeFileError: for a name or a call that is not known, by name
+        :param part: a value that :func:`read_pickle` returned, or a part of it
+        :raises UnsafeFileError: if the part contains an unknown name or call; the error names it
         """
         if isinstance(part, (*_SCALARS, bytearray)):
             self._count(1)
@@ -338,13 +340,13 @@ class Rebuild:
 @dataclass(frozen=True)
 class Handler:
     """
-    What a call of a known name makes, and what of the call it takes. Anything else there refuses the file.
+    Handler for calls of a known name: it makes the object, and refuses calls with anything that it does not accept.
 
-    :param make: given the record, and what makes objects of its parts
-    :param args: how many arguments, the fewest and the most
-    :param state: whether it takes one
-    :param items: whether it takes any
-    :param only: given so many arguments, whether it takes them
+    :param make: makes the object from the record of the call and the :class:`Rebuild` for its parts
+    :param args: the smallest and the largest number of arguments
+    :param state: whether the object may be given a state
+    :param items: whether the object may be given items
+    :param only: returns whether the arguments are accepted; called only if their number is allowed
     """
 
     make: Callable[[Call, Rebuild], Any]
@@ -361,7 +363,7 @@ class Handler:
         return self.make(call, make)
 
     def takes(self, call: Call) -> bool:
-        """Return whether a call, and what is done to its result, is all that the known one takes."""
+        """Return whether the handler accepts a call: its arguments, and what is done to its result."""
         return self._takes_arguments(call) and self._takes_changes(call)
 
     def _takes_arguments(self, call: Call) -> bool:
@@ -376,12 +378,12 @@ def code_in(
     noted: Iterable[Name | Call], names: Container[Name], calls: Mapping[Name, Callable[[Call], bool]]
 ) -> list[str]:
     """
-    List what unpickling would import or call that is not known.
+    List the unknown names that unpickling would import or call.
 
-    :param noted: by :func:`read_pickle`
-    :param names: what may be imported
-    :param calls: what may also be called, and whether it may be called so
-    :return: names, sorted
+    :param noted: the names and calls that :func:`read_pickle` recorded
+    :param names: the names that may be imported
+    :param calls: the names that may also be called, each with a function that returns whether a call is allowed
+    :return: the unknown names, sorted
     """
     found = set()
     for part in noted:

@@ -1,4 +1,4 @@
-"""What a saved file holds, what of it is code, and whether it would be opened."""
+"""Description of a saved file: its contents, the code in it, and whether it would be opened."""
 
 import contextlib
 import io
@@ -24,7 +24,7 @@ from sb3_tdc.safe_load.models import load_safely, read_model_fields
 from sb3_tdc.safe_load.reading import reading
 from sb3_tdc.safe_load.regular_files import open_regular
 
-_SHOWN = 12  # lines of each list
+_SHOWN = 12  # most lines of each list
 
 
 _PICKLED = {
@@ -34,12 +34,12 @@ _PICKLED = {
 
 def inspect(path: Path, algorithm: type[OffPolicyAlgorithm] | None = None) -> tuple[list[str], bool]:
     """
-    Describe a file without running, importing or unpickling anything of it.
+    Describe a file without running, importing or unpickling anything in it.
 
-    :param path: the zip of a model, ``VecNormalize`` statistics, a replay buffer
-    :param algorithm: of a model; None: by its policy
-    :return: lines for the screen, and whether it would be opened
-    :raises ValueError: if it is none of these
+    :param path: the zip of a model, ``VecNormalize`` statistics or a replay buffer
+    :param algorithm: the algorithm of a model; None for the one that its policy belongs to
+    :return: lines for the screen, and whether the file would be opened
+    :raises ValueError: if the file cannot be read as one of these
     """
     with reading(str(path)), open_regular(path, MAX_REPLAY_BYTES) as (file, size):
         if zipfile.is_zipfile(file):
@@ -58,7 +58,11 @@ def inspect(path: Path, algorithm: type[OffPolicyAlgorithm] | None = None) -> tu
 
 
 class _StandIn(gym.Env):
-    """An environment that is never stepped. :param fields: of a model, with its spaces"""
+    """
+    Environment that only has spaces and is never stepped.
+
+    :param fields: the fields of a model, including its spaces
+    """
 
     def __init__(self, fields: dict[str, Any]):
         self.observation_space, self.action_space = fields["observation_space"], fields["action_space"]
@@ -66,8 +70,9 @@ class _StandIn(gym.Env):
 
 def _stand_in(path: Path, algorithm: type[OffPolicyAlgorithm] | None) -> VecEnv | None:
     """
-    Return what a model with a hindsight buffer needs of its environment to be opened; None for all others.
+    Return a stand-in environment for a model with a hindsight buffer, which cannot be opened without one.
 
+    :return: the environment; None for all other models
     :raises ValueError: if the model is refused
     """
     fields = read_model_fields(path, algorithm)

@@ -1,4 +1,4 @@
-"""The objects that a saved model may hold: what each name of a file stands for, and how it is made from plain data."""
+"""The objects that a saved model may hold: their names in a file, and how each is made from plain data."""
 
 import math
 import re
@@ -26,15 +26,15 @@ from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
 from sb3_tdc.safe_load.reading import MAX_ITEMS
 
 MAX_DIMENSIONS = 8
-MAX_CHOICES = 65_536  # of a MultiDiscrete space, which are summed up one by one
+MAX_CHOICES = 65_536  # size of the nvec of a MultiDiscrete space, which SB3 sums one by one
 
 
 def pickled_name(cls: type) -> Name:
-    """Return what a pickle calls a class."""
+    """Return the name by which a pickle refers to a class."""
     return Name(cls.__module__, cls.__qualname__)
 
 
-# Each is called without arguments, or by the policy with its own
+# Each class is called without arguments, or with those that the policy or the algorithm passes to it
 CLASSES: dict[Name, type] = {
     pickled_name(cls): cls
     for cls in (
@@ -55,7 +55,7 @@ def _state(call: Call) -> dict[str, Any]:
 
 
 def _attributes(call: Call, make: Rebuild, *names: str) -> list[Any]:
-    """Return some attributes of an object, in order; the others are never looked at."""
+    """Return the named attributes of an object, in order; its other attributes are not read."""
     state = _state(call)
     missing = [name for name in names if name not in state]
     if missing:
@@ -79,7 +79,7 @@ def _dtype(call: Call, make: Rebuild) -> np.dtype:
 
 
 def _array(raw: Any, dtype: Any, shape: Any, order: str, budget: Budget) -> np.ndarray:
-    """Return (shape), writable; there must be as many bytes as it takes."""
+    """Return a writable array (shape); ``raw`` must have exactly as many bytes as the array."""
     sizes = shape if isinstance(shape, tuple) else ()
     whole = isinstance(shape, tuple) and all(type(size) is int and size >= 0 for size in sizes)
     if not isinstance(raw, (bytes, bytearray)) or not isinstance(dtype, np.dtype) or not whole:
@@ -89,7 +89,8 @@ def _array(raw: Any, dtype: Any, shape: Any, order: str, budget: Budget) -> np.n
         raise UnsafeFileError(f"an array of {len(raw):,} bytes that says it is another size")
     budget.take_bytes(len(raw))
     array = np.frombuffer(raw, dtype).reshape(sizes, order="F" if order == "F" else "C")
-    return array if isinstance(raw, bytearray) else array.copy()  # a replay buffer's gigabytes are not copied
+    # The array of a bytearray is writable already, so the gigabytes of a replay buffer are not copied
+    return array if isinstance(raw, bytearray) else array.copy()
 
 
 def _array_of_state(call: Call, make: Rebuild) -> np.ndarray:
@@ -105,7 +106,7 @@ def _array_of_buffer(call: Call, make: Rebuild) -> np.ndarray:
 
 
 def _numpy_scalar(call: Call, make: Rebuild) -> Any:
-    """Return a number of numpy."""
+    """Return a NumPy scalar."""
     dtype, raw = _arguments(call, make, 2)
     return _array(raw, dtype, (), "C", make.budget)[()]
 
@@ -115,7 +116,7 @@ def _scalar(call: Call, make: Rebuild) -> Any:
 
 
 def _floats(value: Any, budget: Budget) -> np.ndarray:
-    """Convert numbers to those of eight bytes, which are paid for before."""
+    """Convert numbers to float64, after taking the bytes for an array of them from the budget."""
     if isinstance(value, np.ndarray):
         budget.take_bytes(8 * value.size)
     return np.asarray(value, dtype=np.float64)
@@ -128,7 +129,7 @@ def _box(call: Call, make: Rebuild) -> spaces.Box:
     low, high = _attributes(call, make, "low", "high")
     if not (isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and low.shape == high.shape):
         raise UnsafeFileError("a Box without bounds of one shape")
-    make.budget.take_bytes(4 * low.nbytes)  # it keeps copies of both, and where they are finite
+    make.budget.take_bytes(4 * low.nbytes)  # Box keeps copies of both bounds, and masks of where they are finite
     return spaces.Box(low, high, dtype=low.dtype.type)
 
 
@@ -136,7 +137,7 @@ def _dict_space(call: Call, make: Rebuild) -> spaces.Dict:
     (of_keys,) = _attributes(call, make, "spaces")
     if not isinstance(of_keys, dict) or not all(isinstance(key, str) for key in of_keys):
         raise UnsafeFileError("a Dict space without its spaces")
-    if len(of_keys) > MAX_ITEMS:  # networks are built for each of them
+    if len(of_keys) > MAX_ITEMS:  # a network is built for each part
         raise UnsafeFileError(f"a Dict space of {len(of_keys):,} parts, more than {MAX_ITEMS}")
     return spaces.Dict(OrderedDict(of_keys))
 
@@ -161,7 +162,7 @@ def _multi_binary(call: Call, make: Rebuild) -> spaces.MultiBinary:
     return spaces.MultiBinary(size)
 
 
-# -------------------------------------------------------------------- what a run was set up with
+# -------------------------------------------------------------------- the settings of a run
 
 
 def _normal_noise(call: Call, make: Rebuild) -> NormalActionNoise:
@@ -193,7 +194,7 @@ def _noise_arrays(call: Call, make: Rebuild, sigma_name: str = "_sigma") -> tupl
 
 
 def _base_noise(call: Call, make: Rebuild) -> Any:
-    # learn() makes it noise of several environments again, of as many as there are
+    # learn() vectorises the noise again, for the number of environments that the model then has
     return _attributes(call, make, "_base_noise")[0]
 
 
@@ -253,7 +254,7 @@ def _enum_of_value(call: Call, make: Rebuild) -> Enum:
 
 
 def _enum_of_name(call: Call, make: Rebuild) -> Enum:
-    """Return the member of ``getattr(SomeEnum, "MEMBER")``, as the first versions of Python 3.11 pickle it."""
+    """Return the member of ``getattr(SomeEnum, "MEMBER")``, which is how early versions of Python 3.11 pickle it."""
     cls, member = call.args
     return _ENUMS[cls][member]
 
@@ -263,14 +264,14 @@ def _is_member(cls: Any, member: Any) -> bool:
 
 
 def _object(make: Callable[[Call, Rebuild], Any]) -> Handler:
-    """Return what it is: of an object that is made without arguments, and given its attributes."""
+    """Return the handler for an object that is created without arguments and then given its attributes."""
     return Handler(make, state=True)
 
 
 def _of_numpy(make_scalar: Callable[[Call, Rebuild], Any]) -> dict[Name, Handler]:
     return {
         Name("numpy", "dtype"): Handler(_dtype, args=(1, 3), state=True),
-        # numpy 2 moved what numpy 1 had in numpy.core
+        # NumPy 2 renamed numpy.core to numpy._core
         **{
             Name(f"numpy.{core}.{module}", function): handler
             for core in ("core", "_core")
@@ -284,12 +285,12 @@ def _of_numpy(make_scalar: Callable[[Call, Rebuild], Any]) -> dict[Name, Handler
 
 
 _MAPPING = {Name("collections", "OrderedDict"): Handler(_ordered_dict, items=True)}
-# Of plain values; numbers of numpy stay numbers of numpy
+# Calls that make plain values; NumPy scalars stay NumPy scalars
 PLAIN_CALLS: dict[Name, Handler] = {**_MAPPING, **_of_numpy(_numpy_scalar)}
 CALLS: dict[Name, Handler] = {
     **_MAPPING,
     **_of_numpy(_scalar),
-    # gymnasium was gym
+    # Older files name gym, the predecessor of gymnasium
     **{
         Name(f"{gym}.spaces.{module}", space): _object(make)
         for gym in ("gym", "gymnasium")
@@ -315,5 +316,5 @@ CALLS: dict[Name, Handler] = {
     **dict.fromkeys(_ENUMS, Handler(_enum_of_value, args=(1, 1))),
     Name("builtins", "getattr"): Handler(_enum_of_name, args=(2, 2), only=_is_member),
 }
-# Whether a call of a name is one that its entry takes
+# For each name, the function that returns whether its handler accepts a call
 TAKEN: dict[Name, Callable[[Call], bool]] = {name: handler.takes for name, handler in CALLS.items()}

@@ -1,4 +1,4 @@
-"""Saved models."""
+"""Safe reader for saved models."""
 
 from pathlib import Path
 from typing import Any
@@ -34,23 +34,23 @@ def load_safely(
     **kwargs: Any,
 ) -> OffPolicyAlgorithm:
     """
-    Do what ``Algorithm.load`` does, without running anything that is in the file.
+    Load a saved model as ``Algorithm.load`` does, without running anything that is in the file.
 
-    It knows TDC, MEOW, AdvB-TD3, AdvB-SAC and AdvB-TDC, SB3's TD3, SAC and DDPG, and sb3-contrib's TQC.
+    The model may be one of TDC, MEOW, AdvB-TD3, AdvB-SAC and AdvB-TDC, SB3's TD3, SAC and DDPG, or sb3-contrib's TQC.
 
-    The model predicts and continues to learn as the saved one. It differs in this: ``tensorboard_log`` is never the
-    file's, the last observation and the statistics of the last episodes are not kept (an environment is reset when
-    learning begins), and a custom schedule or class is refused unless ``custom_objects`` replaces it.
+    The returned model predicts and continues to learn like the saved one, with three differences. ``tensorboard_log``
+    is never the file's. The last observation and the statistics of the last episodes are not kept (an environment is
+    reset when learning begins). A custom schedule or class is refused unless ``custom_objects`` replaces it.
 
     :param path: zip of a saved model, with or without its suffix
-    :param env: the environment to run it on; None to only predict
+    :param env: the environment to run the model on; None if the model only predicts
     :param device: PyTorch device
-    :param custom_objects: values by field name that replace those of the file, which are then not read
-    :param algorithm: the class of the returned model; None for the one that the file's policy belongs to (of DDPG,
-        which has the same policies, TD3). Required for a variant of TDC
-    :param kwargs: attributes to set over the file's, for instance ``buffer_size=1``
+    :param custom_objects: values by field name that replace those of the file, which are then not used
+    :param algorithm: the class of the returned model; None for the algorithm that the file's policy belongs to (TD3 for
+        a DDPG, which has the same policies). Required for a variant of TDC
+    :param kwargs: attributes that replace those of the file, for instance ``buffer_size=1``
     :raises UnsafeFileError: (a ``ValueError``) if the file is refused or damaged, in one sentence that names the field
-    :raises ValueError: if it is of another algorithm, or of an environment with other spaces
+    :raises ValueError: if the file is of another algorithm, or of an environment with other spaces
     """
     path = Path(path)
     if not path.exists() and path.with_name(f"{path.name}.zip").is_file():
@@ -86,7 +86,7 @@ def load_safely(
 
 def read_model_fields(path: Path, algorithm: type[OffPolicyAlgorithm] | None = None) -> dict[str, Any]:
     """
-    Read and check the fields of a saved model as :func:`load_safely` does; the weights are not looked at.
+    Read and check the fields of a saved model as :func:`load_safely` does, but not its weights.
 
     :raises UnsafeFileError: as :func:`load_safely`
     """
@@ -111,7 +111,7 @@ def read_data(path: str | Path) -> dict[str, Any]:
     """
     Read the fields of a saved model as JSON.
 
-    :return: the JSON of a saved model, as it stands there: nothing in it is checked, rebuilt or run
+    :return: the JSON of a saved model, unchanged: nothing in it is checked, rebuilt or run
     :raises UnsafeFileError: if it is not the zip of a saved model
     """
     with reading(f"{path} is not the zip of a saved model"):
@@ -120,7 +120,7 @@ def read_data(path: str | Path) -> dict[str, Any]:
 
 def read_system_info(path: str | Path) -> str:
     """
-    Read what SB3 notes of the system that a model was saved on.
+    Read SB3's description of the system that a model was saved on.
 
     :return: lines of text
     :raises UnsafeFileError: if it is not the zip of a saved model
@@ -179,7 +179,7 @@ def _make_model(
     for name, value in saved_variables.items():
         with reading(f"pytorch_variables.pth, {shown(name)}"):
             if name not in variables:
-                if value is None:  # SB3 writes it where there is none
+                if value is None:  # SB3 writes None for a variable that the model lacks
                     continue
                 raise UnsafeFileError("it is unknown")
             current = getattr(model, name)
@@ -192,7 +192,7 @@ def _make_model(
 
 
 def _variables(tensors: dict[str, Any]) -> dict[str, Any]:
-    """Take the single tensors from the parts of a zip; ``tensors.pth`` is their name in the first versions of SB3."""
+    """Remove and return the single tensors among the parts of a zip; early SB3 versions call them ``tensors.pth``."""
     found: dict[str, Any] = {}
     for part in ("tensors", "pytorch_variables"):
         values = tensors.pop(part, None) or {}

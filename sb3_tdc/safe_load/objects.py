@@ -25,11 +25,11 @@ from sb3_tdc.safe_load.sb3_fields import MAX_ENVS
 
 def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
     """
-    Do what ``VecNormalize.load`` does, without running anything that is in the file.
+    Load normalisation statistics as ``VecNormalize.load`` does, without running anything that is in the file.
 
     :param path: statistics as SB3 and RL Zoo save them (``vecnormalize.pkl``)
     :param env: the environment to normalise
-    :raises UnsafeFileError: if the file is refused or damaged, or is of other observations
+    :raises UnsafeFileError: if the file is refused or damaged, or is of an environment with other observations
     """
     with reading(f"{path} was not opened"):
         state = _read_object(path, VecNormalize, _normalization_state)
@@ -45,7 +45,7 @@ def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
 
 def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
     """
-    Do what ``model.load_replay_buffer`` does, without running anything that is in the file.
+    Load a replay buffer as ``model.load_replay_buffer`` does, without running anything that is in the file.
 
     :param path: a replay buffer as SB3 saves it, of the same class, size and number of environments as the model's
     :raises UnsafeFileError: if the file is refused or damaged, or is not such a replay buffer
@@ -76,7 +76,7 @@ def load_replay_buffer(path: str | Path, model: OffPolicyAlgorithm) -> None:
 
 
 def _read_object(path: str | Path, cls: type, read_state: Callable[[Call, Rebuild], dict[str, Any]]) -> dict[str, Any]:
-    """Return what ``read_state`` takes from the one pickled object of a class that a file holds."""
+    """Return the result of ``read_state`` for the pickled object in a file, which must be of class ``cls``."""
     with open_regular(path, MAX_REPLAY_BYTES) as (file, size):
         if size == 0:
             raise UnsafeFileError("it is empty")
@@ -89,7 +89,7 @@ def _read_object(path: str | Path, cls: type, read_state: Callable[[Call, Rebuil
 
 
 def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
-    """Return the keyword arguments of ``VecNormalize``, and its statistics; nothing else of the pickle is looked at."""
+    """Return the keyword arguments of ``VecNormalize``, and its statistics; nothing else in the pickle is read."""
     state = call.state
     if not isinstance(state, dict):
         raise UnsafeFileError("VecNormalize without its attributes")
@@ -106,9 +106,9 @@ def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
 
 def _arrays_like(buffer: ReplayBuffer) -> Callable[[Call, Rebuild], dict[str, Any]]:
     """
-    Return what reads a replay buffer: its arrays of numbers, its position and its number of environments alone.
+    Return a function that reads only the numeric arrays, the position and the number of environments of a buffer.
 
-    If hindsight computes rewards with the infos of transitions, it reads them, too.
+    If hindsight computes rewards from the infos of transitions (``copy_info_dict``), the function reads the infos, too.
     """
     names = [name for name, value in vars(buffer).items() if isinstance(value, dict) or _is_numeric(value)]
 
@@ -163,5 +163,5 @@ def _layout(value: Any) -> str:
 
 
 def _same_type(saved: np.dtype, fresh: np.dtype) -> bool:
-    # The fused update keeps observations as float32 where SB3 has float64
+    # The fused update stores observations as float32 where SB3 stores float64
     return saved == fresh or {saved, fresh} == {np.dtype(np.float32), np.dtype(np.float64)}

@@ -1,4 +1,4 @@
-"""What the values of a file have in common, and one way to say that one is not allowed."""
+"""Common parts of the readers: one kind of error, and a check for plain values."""
 
 import math
 from collections.abc import Iterator
@@ -9,12 +9,17 @@ from typing import Any
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.safe_load.budget import UnsafeFileError
 
-MAX_ITEMS = 64  # of a list or mapping in the arguments of a network or an optimizer, and of a Dict space
+MAX_ITEMS = 64  # in a list or mapping of the arguments of a network or an optimizer, and in a Dict space
 
 
 @contextmanager
 def reading(what: str) -> Iterator[None]:
-    """Make whatever a damaged file makes a library raise one error of one sentence, with its place before it."""
+    """
+    Turn any exception that a damaged file causes, also in a library, into an error of one sentence.
+
+    :param what: the beginning of the sentence: the file or the part that is being read
+    :raises UnsafeFileError: for any exception
+    """
     try:
         yield
     except Exception as error:
@@ -23,7 +28,11 @@ def reading(what: str) -> Iterator[None]:
 
 
 def is_plain(value: Any, depth: int = 0) -> bool:
-    """Return whether a value is of finite numbers, texts, booleans, None and classes, in short lists and mappings."""
+    """
+    Return whether a value is plain.
+
+    Plain values are finite numbers, texts, booleans, None, classes and enums, and short lists and mappings of these.
+    """
     if isinstance(value, (bool, str, type, type(None), Enum)):
         return True
     if isinstance(value, (int, float)):

@@ -1,4 +1,4 @@
-"""Regular files alone: what is a pipe, a device or a folder is not opened."""
+"""Readers of regular files, which refuse pipes, devices and folders."""
 
 import os
 import stat
@@ -13,14 +13,14 @@ from sb3_tdc.safe_load.budget import UnsafeFileError
 @contextmanager
 def open_regular(path: str | Path, limit: int) -> Iterator[tuple[IO[bytes], int]]:
     """
-    Open a file to read it.
+    Open a regular file for reading.
 
-    :param limit: bytes that it may have
-    :return: the file, and its size
-    :raises OSError: if there is none
-    :raises UnsafeFileError: if it is no regular file, or is larger
+    :param limit: the largest allowed size in bytes
+    :return: the file, and its size in bytes
+    :raises OSError: if the file does not exist
+    :raises UnsafeFileError: if it is not a regular file, or is larger
     """
-    # Otherwise opening a FIFO waits until something writes into it
+    # Without O_NONBLOCK, opening a FIFO would wait until something writes into it
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(file.fileno())
@@ -35,7 +35,7 @@ def read_text(path: str | Path, limit: int) -> str:
     """
     Return the text of a small file.
 
-    :raises ValueError: if it is larger, no regular file or no text; with its name
+    :raises ValueError: if the file is missing, larger, not regular or not text; the error names it
     """
     try:
         with open_regular(path, limit) as (file, _):

@@ -1,4 +1,4 @@
-"""What the YAML files of a downloaded run may ask for: arguments of the right types, and wrappers that only wrap."""
+"""Checks of the YAML files of a downloaded run: its arguments have the right types, and its wrappers only wrap."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -6,7 +6,7 @@ from typing import Any
 
 from sb3_tdc.common.untrusted import escaped, shown
 
-# Classes that write no file and start no process, by the module that they are in or below
+# Classes that write no file and start no process, by the package or module that contains them
 _WRAPPERS: dict[str, set[str]] = {
     "gymnasium.wrappers": {
         *("AddRenderObservation", "AddWhiteNoise", "AtariPreprocessing", "Autoreset", "ClipAction", "ClipReward"),
@@ -44,9 +44,10 @@ def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where:
     """
     Check the types of a run's arguments.
 
-    :param args: of ``args.yml``
-    :param where: its path, for the error
-    :raises ValueError: if one that is needed is missing, or of another type
+    :param args: content of ``args.yml``
+    :param algorithms: names of the known algorithms
+    :param where: path of the file, for the error
+    :raises ValueError: if a required argument is missing or of another type, or the algorithm is unknown
     """
     for name, kinds in _ARGUMENTS.items():
         if name not in args or not isinstance(args[name], kinds):
@@ -61,11 +62,12 @@ def check_arguments(args: Mapping[str, Any], algorithms: Collection[str], where:
 
 def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str], where: str) -> None:
     """
-    Check that the files of a run name no code but what is known or consented to.
+    Check that the files of a run only name code that is known, or that the user has consented to.
 
-    :param args: of ``args.yml``
-    :param config: of ``config.yml``
+    :param args: content of ``args.yml``
+    :param config: content of ``config.yml``
     :param consented: packages and modules that the user has named
+    :param where: the run, for the error
     :raises ValueError: if the files name code to import that is neither known to be harmless nor consented to
     """
     for _, reason in refused_imports(args, config, consented):
@@ -75,7 +77,7 @@ def check_imports(args: Mapping[str, Any], config: Mapping[str, Any], consented:
 def refused_imports(
     args: Mapping[str, Any], config: Mapping[str, Any], consented: Sequence[str] = ()
 ) -> Iterator[tuple[str, str]]:
-    """Return the module of all code that :func:`check_imports` refuses, each with what is asked for and the remedy."""
+    """Yield the module of each import that :func:`check_imports` refuses, with a description and the remedy."""
     package, _, _ = args["env"].rpartition(":")
     for name in [*(args.get("gym_packages") or []), *([package] if package else [])]:
         if name not in consented:
@@ -93,7 +95,7 @@ def refused_imports(
 
 
 def _wrappers(config: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
-    """Return the key, the name and the keyword arguments of each wrapper."""
+    """Yield the key, the name and the keyword arguments of each wrapper."""
     for key in ("env_wrapper", "vec_env_wrapper"):
         wrappers = config.get(key) or []
         for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:

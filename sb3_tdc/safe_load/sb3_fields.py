@@ -1,4 +1,8 @@
-"""The fields that SB3 saves: of every off-policy algorithm, and of its own, which cannot declare them here."""
+"""
+The fields that SB3 saves: those of every off-policy algorithm, and those of SB3's own algorithms and sb3-contrib's TQC.
+
+These classes are not part of this package, so they cannot declare ``saved_fields``.
+"""
 
 from typing import Any
 
@@ -23,7 +27,7 @@ from sb3_tdc.common.untrusted import shown
 from sb3_tdc.safe_load.reading import is_plain
 
 MAX_ENVS = 10_000
-MAX_CRITICS = 256  # all of them are built before anything is compared
+MAX_CRITICS = 256  # all critics are built before their weights are compared
 
 
 def _instance(*kinds: type) -> Check:
@@ -70,7 +74,7 @@ def _optional(**checks: Check) -> dict[str, SavedField]:
     return {name: SavedField(check, is_required=False) for name, check in checks.items()}
 
 
-# Of every off-policy algorithm
+# Fields of every off-policy algorithm
 OFF_POLICY = {
     **_required(
         policy_class=_subclass(BasePolicy),
@@ -109,13 +113,13 @@ OFF_POLICY = {
     ),
 }
 _N_CRITICS = {"policy_kwargs.n_critics": SavedField(integer(1, MAX_CRITICS), is_required=False)}
-# Where there is a temperature, it is a tensor, and elsewhere in the file
+# log_ent_coef, ent_coef_optimizer and ent_coef_tensor are null: a temperature is a tensor, in another entry
 _SAC = {
     **_required(ent_coef=text_or_number, target_entropy=or_none(text_or_number), target_update_interval=integer(1)),
     **_optional(log_ent_coef=none, ent_coef_optimizer=none, ent_coef_tensor=none),
     **_N_CRITICS,
 }
-# By the full name of the class
+# Fields of each algorithm, by the full name of its class
 OF_SB3: dict[str, dict[str, SavedField]] = {
     "stable_baselines3.td3.td3.TD3": {
         **_required(policy_delay=integer(1), target_policy_noise=number(0.0), target_noise_clip=number(0.0)),

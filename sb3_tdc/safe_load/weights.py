@@ -1,4 +1,4 @@
-"""Tensors, weights and states of optimizers, checked before torch or a network sees them."""
+"""Tensors, weights and optimizer states, checked before PyTorch or a network uses them."""
 
 import inspect
 import io
@@ -29,15 +29,15 @@ _STORAGE_TYPES = {
     "ByteStorage": th.uint8, "BoolStorage": th.bool,
 }  # fmt: skip
 MAX_DIMENSIONS = 8
-MAX_PARAMETERS = 8192  # tensors; 256 critics of three hidden layers have 4,096 with their targets
+MAX_PARAMETERS = 8192  # tensors; 256 critics with three hidden layers have 4,096, target critics included
 
 
 def read_tensors(raw: bytes, budget: Budget) -> Any:
     """
-    Read a ``.pth`` file: tensors are made of the bytes of its records, by what its pickle says of them.
+    Read a ``.pth`` file: its pickle describes the tensors, and its records hold their bytes.
 
-    :param budget: of the file that it is in
-    :return: what ``torch.save`` was given: numbers, texts and tensors (on the CPU), in dicts, lists and tuples
+    :param budget: of the file that contains it
+    :return: the object given to ``torch.save``: numbers, texts and tensors (on the CPU), in dicts, lists and tuples
     """
     entries = read_archive(io.BytesIO(raw), _TENSOR_ENTRIES, budget)
     records = {name.partition("/")[2]: content for name, content in entries.items()}
@@ -48,7 +48,7 @@ def read_tensors(raw: bytes, budget: Budget) -> Any:
     tensors = _Tensors(records, budget)
     known = {
         Name("torch._utils", "_rebuild_tensor_v2"): Handler(tensors.make, args=(6, 7)),
-        # The attributes are those of a state dict: the versions of its modules
+        # The state is the attribute of a state dict, _metadata: the versions of its modules
         Name("collections", "OrderedDict"): Handler(_make_dict, state=True, items=True),
     }
     return Rebuild({}, known, budget)(read_pickle(records["data.pkl"], budget))
@@ -61,7 +61,7 @@ def _make_dict(call: Call, make: Rebuild) -> dict:
 
 
 class _Tensors:
-    """The storages of one file. A storage has one type, and all tensors that name it are parts of the same memory."""
+    """The storages of one file. A storage has one type, and all tensors that refer to it share its memory."""
 
     def __init__(self, records: dict[str, bytes], budget: Budget):
         self.records, self.budget = records, budget
@@ -85,7 +85,7 @@ class _Tensors:
         return flat[offset : offset + size].view(shape)
 
     def _storage(self, storage: Any) -> th.Tensor:
-        """Return (size,), of its type."""
+        """Return a storage as a tensor (size,), of the type of the storage."""
         is_call = isinstance(storage, Call) and storage.function == PERSISTENT and storage.state is None
         if not is_call or not isinstance(storage.args, tuple) or len(storage.args) != 5:
             raise UnsafeFileError("a tensor without its storage")
@@ -100,7 +100,7 @@ class _Tensors:
             self.budget.take_bytes(len(content))
             if dtype == th.bool and content.strip(b"\0\1"):
                 raise UnsafeFileError("booleans that are neither true nor false")
-            # Of its own memory: what is in the file cannot be written to
+            # A bytearray is a writable copy: the bytes of the file are read-only
             self.storages[key] = th.frombuffer(bytearray(content), dtype=dtype) if content else th.empty(0, dtype=dtype)
         if self.storages[key].dtype != dtype:
             raise UnsafeFileError("a storage that is said to be of two types")
@@ -108,18 +108,18 @@ class _Tensors:
 
 
 class _OnMeta:
-    """Before a policy class: its networks get shapes, but no memory."""
+    """Mixin that puts a policy on PyTorch's ``meta`` device: its networks get shapes, but no memory."""
 
     device = th.device("meta")
 
 
 @contextmanager
 def _few_parameters(budget: Budget) -> Iterator[None]:
-    """Bound how many parameters networks are given, and how long that takes: also without memory, each takes 0.1 ms."""
+    """Bound the number of parameter tensors, and the time to build them: each takes 0.1 ms, even without memory."""
     thread, left = get_ident(), iter(range(MAX_PARAMETERS))
 
     def count(*_: Any) -> None:
-        if get_ident() != thread:  # networks that others build meanwhile
+        if get_ident() != thread:  # a network that another thread builds meanwhile
             return
         budget.check_time()
         if next(left, None) is None:
@@ -134,16 +134,17 @@ def _few_parameters(budget: Budget) -> Iterator[None]:
 
 def check_weights(policy_class: type[BasePolicy], fields: dict[str, Any], weights: Any, budget: Budget) -> None:
     """
-    Compare the weights of the file with the networks that its arguments ask for, before these are built.
+    Compare the weights of the file with the networks that its arguments describe, before the networks are built.
 
-    :param budget: of the file. Tensors may be parts of one storage, so the networks can be larger than what was read
+    :param budget: of the file. Tensors may share a storage, so the networks can be larger than the bytes of the file
+    :raises UnsafeFileError: if the weights do not fit the networks, or are not finite
     """
     kwargs = {**fields.get("policy_kwargs", {}), "optimizer_class": th.optim.SGD, "optimizer_kwargs": {}}
     if "stochastic_actor" in fields:
         kwargs["stochastic_actor"] = fields["stochastic_actor"]
     shaped: type[Any] = type(policy_class.__name__, (_OnMeta, policy_class), {})
     validates = th.distributions.Distribution._validate_args
-    th.distributions.Distribution.set_default_validate_args(False)  # it would look at values, of which there are none
+    th.distributions.Distribution.set_default_validate_args(False)  # it would read values, and meta tensors have none
     try:
         with reading("policy_kwargs"), th.device("meta"), _few_parameters(budget):
             policy = shaped(fields["observation_space"], fields["action_space"], lambda _: 1.0, **kwargs)
@@ -171,7 +172,7 @@ def check_optimizer(optimizer: th.optim.Optimizer, saved: Any) -> None:
     """
     Check the saved state of an optimizer.
 
-    :raises UnsafeFileError: unless the saved state is one that this optimizer has after some steps, or before any
+    :raises UnsafeFileError: unless this optimizer can have the saved state, before or after some steps
     """
     if not isinstance(saved, dict) or set(saved) != {"state", "param_groups"}:
         raise UnsafeFileError("it is not the state of an optimizer")
@@ -185,7 +186,7 @@ def check_optimizer(optimizer: th.optim.Optimizer, saved: Any) -> None:
             raise UnsafeFileError("it is of other parameters")
         parameters += fresh["params"]
         for name in {*group, *fresh} - {"params"}:
-            # An older PyTorch wrote fewer of them, and load_state_dict takes the defaults
+            # Older versions of PyTorch wrote fewer options; load_state_dict fills in the others
             if name in group and (name not in fresh or not _is_like(group[name], fresh[name])):
                 raise UnsafeFileError(f"its {shown(name)} is unknown, or is not what it can be")
     expected = _state_after_a_step(optimizer)
@@ -200,7 +201,7 @@ def check_optimizer(optimizer: th.optim.Optimizer, saved: Any) -> None:
 
 
 def _state_after_a_step(optimizer: th.optim.Optimizer) -> dict[str, Any]:
-    """Return what this optimizer keeps of a parameter, for one of shape (2,)."""
+    """Return the state that this optimizer keeps for a parameter of shape (2,), after one step."""
     parameter = th.zeros(2, requires_grad=True)
     kind: Any = type(optimizer)
     taken = inspect.signature(kind).parameters
@@ -219,13 +220,13 @@ def _is_state(value: Any, expected: Any, shape: th.Size) -> bool:
         return math.isfinite(value) and value >= 0
     if not isinstance(value, th.Tensor) or not value.dtype.is_floating_point:
         return False
-    # Moments of another type would each be converted, also those that are parts of one storage
+    # load_state_dict would convert moments of another type, and so copy even those that share a storage
     fits = value.numel() == 1 if is_number else value.shape == shape and value.dtype == expected.dtype
     return fits and bool(value.isfinite().all()) and not (is_number and value.item() < 0)
 
 
 def _is_like(value: Any, fresh: Any) -> bool:
-    """Return whether an option is of the kind that the optimizer has: a number, or true or false."""
+    """Return whether a saved option is of the same kind as the optimizer's: a number, a truth value or a tuple."""
     if isinstance(value, bool) or isinstance(fresh, bool):
         return isinstance(value, bool | None) and isinstance(fresh, bool | None)
     if isinstance(fresh, (int, float)):
