@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sb3_tdc.safe_load import UnsafeFileError, load_safely
     from sb3_tdc.tdc import TDC
 
-# Imported when they are asked for: PyTorch takes seconds, in which `sb3-tdc` could answer neither --help nor Ctrl-C
+# Imported on first access: importing PyTorch takes seconds, during which `sb3-tdc` would ignore --help and Ctrl-C
 _MODULES = {
     "MEOW": "meow",
     "TDC": "tdc",

@@ -1,4 +1,4 @@
-"""The algorithms that the commands know, by name."""
+"""The algorithms of the commands, by name."""
 
 from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm

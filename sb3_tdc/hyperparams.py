@@ -1,7 +1,7 @@
 """
-YAML files → validated keyword arguments of an algorithm. Keys are RL Zoo's; nothing is ever evaluated.
+Hyperparameter files (YAML), read into validated keyword arguments of an algorithm.
 
-Knows neither the command line nor environments.
+The keys are RL Zoo's. No value is evaluated as code. This module knows neither the command line nor environments.
 """
 
 import collections.abc
@@ -28,7 +28,7 @@ from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest, unknown
 from sb3_tdc.common.signatures import constructor_parameters
 
-# What an entry may say in addition to the keyword arguments of the algorithm, with its type
+# Keys that an entry may have in addition to the keyword arguments of the algorithm, with their types
 _RUN_KEYS: dict[str, Any] = {
     "n_timesteps": int,
     "n_envs": int,
@@ -46,28 +46,28 @@ _RUN_LIMITS: Limits = {
     **dict.fromkeys(("n_timesteps", "n_envs", "frame_stack"), (1, math.inf)),
     "noise_std": (0.0, math.inf),
 }
-# Keyword arguments that belong to one run, not to an environment, and the flags of train.py for them
+# Keyword arguments that belong to one run, not to an environment, and the flags of train.py that set them
 _FLAGS = {name: f"--{name.replace('_', '-')}" for name in ("env", "seed", "device", "verbose", "tensorboard_log")}
 _NO_HYPERPARAMETERS = {*_FLAGS, "self", "_init_setup_model"}
-# What the algorithm itself passes to the policy
+# Arguments that the algorithm itself passes to the policy
 POLICY_ARGUMENTS = {"self", "observation_space", "action_space", "lr_schedule"}
-# Where a class may be named without its module
+# Modules whose classes may be named without the module
 _CLASS_MODULES = ("torch.nn", "torch.optim", "stable_baselines3", "stable_baselines3.common.buffers")
-# Whose keyword arguments a mapping holds, and those that are not the user's
+# Mappings of keyword arguments: the class that takes them, and its arguments that the user cannot set
 _OPTIONS: dict[str, tuple[type, tuple[str, ...]]] = {
     "normalize": (VecNormalize, ("venv",)),
     "monitor_kwargs": (Monitor, ("env", "filename")),
 }
 _NOISE_TYPES = ("normal", "ornstein-uhlenbeck")
 _OF_NOISE = ("noise_type", "noise_std")
-# Wrappers with statistics that the policy depends on, and that are not saved with it
+# Wrappers whose statistics the policy depends on, but which are not saved with it
 _NORMALIZING = (VecNormalize, NormalizeObservation)
 
 
 @dataclass
 class Hyperparams:
     """
-    One validated entry.
+    One validated entry of a hyperparameter file.
 
     :param raw: the entry as written, for ``config.yml``
     :param model: keyword arguments of the algorithm's constructor
@@ -76,8 +76,8 @@ class Hyperparams:
     :param env_wrapper: callables that take and return an environment
     :param vec_env_wrapper: the same for a vectorised environment
     :param callbacks: factories of callbacks
-    :param noise_std: standard deviation of the action noise of ``noise_type``, in normalised action units; of two
-        values, the first is that of the first environment, the second that of the last
+    :param noise_std: standard deviation of the action noise of ``noise_type``, in normalised action units; a
+        list of two values gives that of the first environment and that of the last
     """
 
     raw: dict[str, Any]
@@ -96,12 +96,12 @@ class Hyperparams:
 
     @property
     def schedules(self) -> list[str]:
-        """The hyperparameters that change with the share of ``n_timesteps`` that is left."""
+        """Return the names of the hyperparameters that are schedules of the remaining share of ``n_timesteps``."""
         return [name for name, value in self.model.items() if isinstance(value, LinearSchedule)]
 
 
 def hyperparams_file(algo: str) -> Path:
-    """Return the file of an algorithm that comes with this package; a variant (``tdc-shift``) has its algorithm's."""
+    """Return this package's file of an algorithm; a variant (``tdc-shift``) uses the file of its algorithm."""
     package = Path(__file__).parent
     installed, checkout = package / "_hyperparams", package.parent / "hyperparams"
     return (installed if installed.is_dir() else checkout) / f"{algo.partition('-')[0]}.yml"
@@ -109,10 +109,10 @@ def hyperparams_file(algo: str) -> Path:
 
 def read_entry(path: Path, env_id: str, preset: str | None = None) -> tuple[dict[str, Any], str]:
     """
-    Return the entry of an environment, or else of its nearest version, with the file's ``default`` merged under it.
+    Return the entry of an environment, or else of its nearest version, completed by the file's ``default``.
 
-    :param preset: the name of an entry to take instead
-    :return: the entry and its name in the file: ``default`` if there is none of any version
+    :param preset: the name of an entry to use instead
+    :return: the entry and its name in the file: ``default`` if no version of the environment has an entry
     :raises ValueError: if the file cannot be read, or has neither an entry nor a default
     """
     try:
@@ -130,7 +130,7 @@ def read_entry(path: Path, env_id: str, preset: str | None = None) -> tuple[dict
 
 
 def _nearest_version(env_id: str, names: Iterable[Any]) -> str:
-    """Return the name that is an id's nearest version; of two that are as near, the newer; or ``default``."""
+    """Return the name of an id's nearest version (of two equally near, the newer), or ``default`` if there is none."""
     names = [str(name) for name in names]
     if env_id in names:
         return env_id
@@ -160,9 +160,9 @@ def parse(
     :param entry: as read from the file
     :param algorithm: its constructor's annotations are the schema
     :param where: the file and the environment, for the error
-    :param overrides: values that replace those of the entry; what depends on several keys is checked on all together
-    :param where_overrides: where these were given, for the error
-    :raises ValueError: naming the key, what it was, what is allowed, and the nearest known key
+    :param overrides: values that replace those of the entry; conditions on several keys are checked after the merge
+    :param where_overrides: where the overrides were given, for the error
+    :raises ValueError: naming the key, its value, the allowed values, and the nearest known key
     """
     overrides = overrides or {}
     entry = _without_other_noise(entry, overrides)
@@ -209,7 +209,7 @@ def parse(
 def constructor_hints(cls: type) -> dict[str, Any]:
     """Return the annotation of every argument of a constructor, including those it passes on by ``**kwargs``."""
     hints = {name: parameter.annotation for name, parameter in constructor_parameters(cls).items()}
-    # An annotation that is missing, or a text, allows anything
+    # A missing annotation, or one that is a string, allows any value
     return {
         name: Any if hint is inspect.Parameter.empty or isinstance(hint, str) else hint for name, hint in hints.items()
     }
@@ -219,12 +219,12 @@ def convert_mapping(
     mapping: dict[str, Any], hints: dict[str, Any], where: str, limits: Limits | None = None
 ) -> dict[str, Any]:
     """
-    Return the values as their annotations want them.
+    Convert every value of a mapping to the type of its annotation.
 
-    :param hints: the annotation of every key that is known
-    :param where: for the error
-    :param limits: of numbers, and of those within a value
-    :raises ValueError: naming the key, what it was and what is allowed
+    :param hints: the annotation of every known key
+    :param where: where the mapping was given, for the error
+    :param limits: limits by key, which hold for a number and for every number within a value
+    :raises ValueError: naming the key, its value and the allowed values
     """
     converted = {}
     for key, value in mapping.items():
@@ -244,7 +244,7 @@ def convert_mapping(
 
 
 def _numbers_in(value: Any) -> Iterator[float]:
-    """Yield a number, the number that a schedule begins with, or those in a list or a mapping."""
+    """Yield the numbers in a value: the number itself, the first of a schedule, or those in a list or a mapping."""
     if isinstance(value, LinearSchedule):
         yield value(1.0)
     elif isinstance(value, (list, tuple, dict)):
@@ -255,7 +255,7 @@ def _numbers_in(value: Any) -> Iterator[float]:
 
 
 def _without_other_noise(entry: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
-    """Leave out the noise of an entry, where it is overridden in the other of the two ways to give it."""
+    """Drop the entry's noise if the overrides set the noise by the other keys (``action_noise``, or ``_OF_NOISE``)."""
     if "action_noise" in overrides:
         return {key: value for key, value in entry.items() if key not in _OF_NOISE}
     if any(key in overrides for key in _OF_NOISE):
@@ -299,9 +299,9 @@ def _convert_policy(
 
 def _convert(value: Any, hint: Any) -> Any:
     """
-    Return the value as the annotation wants it.
+    Convert a value to the type of an annotation.
 
-    :raises TypeError, ValueError: if it cannot be
+    :raises TypeError, ValueError: if that is not possible
     """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
@@ -351,7 +351,7 @@ def _convert_union(value: Any, members: tuple[Any, ...]) -> Any:
 
 
 def _number(value: Any) -> float:
-    """Return a number: it may be given as one of the texts that YAML makes of 3e-4 and 1e6."""
+    """Return a number. It may be a string, since YAML reads 3e-4 and 1e6 as strings."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise TypeError
     try:
@@ -382,7 +382,7 @@ def _import_class(name: Any, base: Any = object) -> type:
 
 
 def _factories(entries: Any, where: str) -> list[Callable]:
-    """Convert ``module.Class``, ``{module.Class: {keyword: value}}``, or a list of these."""
+    """Convert ``module.Class``, ``{module.Class: {keyword: value}}``, or a list of these, to factories."""
     factories = []
     for entry in [] if entries is None else entries if isinstance(entries, list) else [entries]:
         name, kwargs = next(iter(entry.items())) if isinstance(entry, dict) and len(entry) == 1 else (entry, {})

@@ -1,5 +1,5 @@
 """
-TDC and MEOW in RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo tdc --env Hopper-v4``.
+TDC and MEOW within RL Zoo itself: ``register()``, or ``python -m sb3_tdc.zoo train --algo tdc --env Hopper-v4``.
 
 The only module that imports ``rl_zoo3`` (extra ``[zoo]``).
 """
@@ -16,7 +16,7 @@ from sb3_tdc.tdc import TDC
 
 def register() -> None:
     """
-    Make ``tdc`` and ``meow`` known to RL Zoo's training, enjoying and Optuna search.
+    Register ``tdc`` and ``meow`` with RL Zoo, for its training, its playing and its Optuna search.
 
     :raises ImportError: if rl_zoo3 is missing, with the command that installs it
     """
@@ -33,7 +33,7 @@ def register() -> None:
 
 def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
-    Sample Optuna's search space: RL Zoo's for TD3, λ among the paper's candidates (and 0), and the quantiles.
+    Sample from the search space: RL Zoo's for TD3, λ among the paper's candidates (and 0), and ``n_quantiles``.
 
     :param trial: an ``optuna.Trial``
     :return: keyword arguments of TDC
@@ -43,12 +43,12 @@ def sample_tdc_params(trial: Any, n_actions: int, n_envs: int, additional_args: 
     hyperparams = sample_td3_params(trial, n_actions, n_envs, additional_args)
     hyperparams["lam"] = trial.suggest_float("lam", 0.0, 1.0, step=0.1)
     hyperparams["policy_kwargs"]["n_quantiles"] = trial.suggest_categorical("n_quantiles", [16, 25, 64])
-    return {"action_noise": None, **hyperparams}  # no noise sampled is none, not TDC's default
+    return {"action_noise": None, **hyperparams}  # a trial without noise has none, not TDC's default
 
 
 def sample_meow_params(trial: Any, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
     """
-    Sample Optuna's search space: RL Zoo's for TD3 without its noise, α, and the upper limit of log σ.
+    Sample from the search space: RL Zoo's for TD3 without its noise, α, and the upper limit of log σ.
 
     :param trial: an ``optuna.Trial``
     :return: keyword arguments of MEOW
@@ -63,7 +63,7 @@ def sample_meow_params(trial: Any, n_actions: int, n_envs: int, additional_args:
 
 def convert_meow_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """
-    Convert the parameters of a trial of Optuna.
+    Convert the sampled parameters to hyperparameters of MEOW.
 
     :param sampled: the parameters of a finished Optuna trial
     :return: hyperparameters as in a YAML file
@@ -77,7 +77,7 @@ def convert_meow_params(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
     """
-    Convert the parameters of a trial of Optuna.
+    Convert the sampled parameters to hyperparameters of TDC.
 
     :param sampled: the parameters of a finished Optuna trial
     :return: hyperparameters as in a YAML file
@@ -94,11 +94,11 @@ def convert_tdc_params(sampled: dict[str, Any]) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Run RL Zoo's ``train`` or ``enjoy`` with TDC and MEOW in it.
+    Run RL Zoo's ``train`` or ``enjoy`` with TDC and MEOW registered.
 
-    ``train`` with ``--algo tdc`` or ``meow``, and without ``-conf``, takes this package's hyperparameters.
+    ``train`` with ``--algo tdc`` or ``meow``, and without ``-conf``, uses this package's hyperparameters.
 
-    :param argv: arguments, those of the process by default
+    :param argv: arguments; by default, those of the process
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] not in (["train"], ["enjoy"]):
@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     relevant.add_argument("--algo")
     chosen, _ = relevant.parse_known_args(arguments)
     if command == "train" and chosen.algo in ("tdc", "meow"):
-        arguments = ["-conf", str(hyperparams_file(chosen.algo)), *arguments]  # the user's own comes later, and counts
+        arguments = ["-conf", str(hyperparams_file(chosen.algo)), *arguments]  # the user's -conf comes later and wins
     sys.argv = [f"sb3_tdc.zoo {command}", *arguments]  # RL Zoo reads its arguments from there
     {"train": train, "enjoy": enjoy}[command]()
 

@@ -1,8 +1,8 @@
 """
-Variants of TDC that the experiments compare (docs/lambda.md), and that the package does not offer as options.
+Variants of TDC that the experiments compare (docs/lambda.md), but that the package does not offer as options.
 
-Their names begin with that of TDC, whose hyperparameters they have. The commands know them; ``load_safely``
-needs the class as ``algorithm``.
+Their names begin with that of TDC, whose hyperparameters they use. The commands know them; ``load_safely``
+requires the class as its argument ``algorithm``.
 """
 
 from typing import ClassVar
@@ -18,12 +18,12 @@ from sb3_tdc.common.saved_fields import SavedField, number
 from sb3_tdc.tdc import TDC
 from sb3_tdc.tdc.quantiles import Target
 
-# The weight of the newest measurement in the size of errors: the average is over about 1,000 updates
+# The weight of the newest measurement in the moving average of the errors' size, which spans about 1,000 updates
 _KAPPA_WEIGHT = 0.05
 
 
 class ShiftedTDC(TDC):
-    """The abstract's other reading: the quantiles of the selected critic are moved down by λσ."""
+    """TDC as the paper's abstract can also be read: the quantiles of the selected critic are moved down by λσ."""
 
     color: ClassVar[str | None] = "#8C564B"
 
@@ -64,7 +64,7 @@ class PessimisticTDC(CalibratedTDC):
 
 
 class ScaledKappaTDC(TDC):
-    """κ follows the size of the errors that it bounds: a moving average of mean |y_j − z_k| at every 50th update."""
+    """TDC whose κ follows the size of the errors: a moving average of mean |y_j − z_k|, taken at every 50th update."""
 
     color: ClassVar[str | None] = "#BCBD22"
 

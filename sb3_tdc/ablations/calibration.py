@@ -1,7 +1,7 @@
 """
 TDC that calibrates λ by comparing the returns of training episodes with the first critic's predictions.
 
-After ACC (Dorka et al. 2021); docs/lambda.md has the equations, and what was found.
+It follows ACC (Dorka et al. 2021); docs/lambda.md has the equations and the findings.
 """
 
 import math
@@ -17,32 +17,32 @@ from sb3_tdc.critics.episodes import EVERY, Steps, predict_quantiles
 from sb3_tdc.critics.returns import discounted_returns
 from sb3_tdc.tdc import TDC
 
-# The largest λ of a calibration: beyond, the wider critic is selected nearly everywhere
+# The largest λ of a calibration: beyond it, the wider critic is selected nearly everywhere
 MAX_LAM = 10.0
-# η, the largest change of λ at once
+# η, the largest change of λ in one calibration step
 RATE = 0.1
-# The weight of the newest error in the moving average of their size
+# The weight of the newest errors in the moving average of the errors' size
 SCALE_WEIGHT = 0.05
-# The least number of steps of ended episodes, and of updates, between two changes of λ
+# The smallest number of steps of ended episodes, and of updates, between two changes of λ
 PERIOD = 1_000
-# At most this many environments are followed
+# The largest number of environments whose episodes are followed
 MAX_FOLLOWED = 16
-# The longest horizon, 1/(1 − γ), for which a calibration waits in the beginning
+# The longest horizon, 1/(1 − γ) in steps, that a calibration waits for before it begins
 _MAX_HORIZON = 1_000
 
 
 def calibrate(lam: float, scale: float, errors: np.ndarray, least: float) -> tuple[float, float]:
     """
-    Move λ towards values that are right on average: up after underestimation, down after overestimation.
+    Move λ so that predicted values become right on average: up after underestimation, down after overestimation.
 
     λ ← clip(λ + η·clip(mean(G − Q₁)/scale, −1, 1), least, λ_max), where scale is a moving average of |G − Q₁|, so that
     the scale of rewards does not matter.
 
     :param lam: λ
-    :param scale: 0 before the first errors
+    :param scale: the moving average so far; 0 before the first errors
     :param errors: G − Q₁
     :param least: the smallest λ
-    :return: λ and scale
+    :return: the new λ and the new scale
     """
     size = float(np.abs(errors).mean())
     scale = scale + SCALE_WEIGHT * (size - scale) if scale > 0 else size
@@ -52,10 +52,10 @@ def calibrate(lam: float, scale: float, errors: np.ndarray, least: float) -> tup
 
 def updates_before(tau: float, gamma: float) -> float:
     """
-    Return after how many updates a calibration begins: 1/(τ·(1 − γ)).
+    Return the number of updates after which a calibration begins: 1/(τ·(1 − γ)).
 
-    Values grow from those of new networks to their size over as many: a target takes about 1/τ updates to follow, and
-    the values of 1/(1 − γ) steps follow one another. λ is not the reason that they are too small until then.
+    The values of new networks take about this many updates to grow to their full size: a target follows in about 1/τ
+    updates, and values depend on one another over 1/(1 − γ) steps. Until then they are too small, but not because of λ.
     """
     horizon = min(1 / (1 - gamma), _MAX_HORIZON) if gamma < 1 else _MAX_HORIZON
     return horizon / tau if tau > 0 else math.inf
@@ -63,10 +63,10 @@ def updates_before(tau: float, gamma: float) -> float:
 
 class Calibration:
     """
-    The episodes under way, and the errors of the ended ones since λ was changed.
+    The episodes in progress, and the errors of the episodes that ended since λ was last changed.
 
-    :ivar timestep: of the last step that was followed
-    :ivar last_update: count of gradient steps when λ was changed
+    :ivar timestep: count of timesteps at the last step that was followed
+    :ivar last_update: count of gradient steps when λ was last changed
     """
 
     def __init__(self, n_updates: int = 0) -> None:
@@ -77,7 +77,7 @@ class Calibration:
         self.timestep: int | None = None
 
     def begin_episodes(self, n_envs: int) -> None:
-        """Forget the episodes under way. Of many environments, which may explore differently, some are followed."""
+        """Drop the episodes in progress. Follow a spread of many environments, which may explore differently."""
         followed = np.linspace(0, n_envs - 1, min(n_envs, MAX_FOLLOWED)).round().astype(int)
         self.episodes = {int(i): Steps(EVERY) for i in followed}
 
@@ -85,7 +85,7 @@ class Calibration:
         """
         Begin the next episode of an environment.
 
-        :param errors: G − Q₁ of the ended one, where it counts
+        :param errors: G − Q₁ of the ended episode, or None if it does not count
         """
         if errors is not None:
             self.errors.append(errors)
@@ -94,7 +94,7 @@ class Calibration:
 
     def take_errors(self, n_updates: int) -> np.ndarray | None:
         """
-        Return the errors with which λ is to be changed now, if it is.
+        Return the errors collected so far and begin again, or None if λ is not to be changed yet.
 
         :param n_updates: count of gradient steps
         """
@@ -109,10 +109,10 @@ class CalibratedTDC(TDC):
     """
     TDC whose λ begins at ``lam``, rises after underestimation and falls after overestimation.
 
-    Another ``lam`` than the one that the calibration began at starts it again.
+    A ``lam`` that differs from the one at which the calibration began starts it again.
 
-    :param args: those of TDC
-    :param kwargs: those of TDC; ``lam`` is a number from 0 to 10
+    :param args: arguments of TDC
+    :param kwargs: arguments of TDC; ``lam`` is a number from 0 to 10
     """
 
     limits: ClassVar[Limits] = {**TDC.limits, "lam": (0.0, MAX_LAM)}
@@ -124,7 +124,7 @@ class CalibratedTDC(TDC):
     captured_attributes: ClassVar[tuple[str, ...]] = (*TDC.captured_attributes, "_calibration")
     least: ClassVar[float] = 0.0
     color: ClassVar[str | None] = "#000000"
-    # Before the first calibration
+    # Values before the first calibration
     _calibrated: float = 0.0
     _calibrated_from: float | None = None
     _error_scale: float = 0.0
@@ -141,7 +141,7 @@ class CalibratedTDC(TDC):
 
     @property
     def calibrated(self) -> float:
-        """Return the calibrated number: λ where it is not negative."""
+        """Return the calibrated number, which is λ unless it is negative."""
         return self._calibrated if self._calibrated_from == self.lam else float(self.lam)  # type: ignore[arg-type]
 
     @property
@@ -159,7 +159,7 @@ class CalibratedTDC(TDC):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         observation, timestep = self._last_obs, self.num_timesteps
         prepared = super()._setup_learn(*args, **kwargs)
-        # A callback that stops a rollout makes SB3 lose its last step
+        # If a callback stopped the last rollout, SB3 did not store its last step, so the episodes are incomplete
         if self._last_obs is not observation or timestep != self._calibration.timestep:
             self.forget_episodes()
         return prepared
@@ -182,7 +182,7 @@ class CalibratedTDC(TDC):
     def _follow_episodes(
         self, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
-        """Add a step to the episodes, and change λ if enough of them have ended."""
+        """Add a step to the episodes, and change λ if enough steps of ended episodes have been collected."""
         normalization, calibration = self._vec_normalize_env, self._calibration
         rewards = reward if normalization is None else normalization.get_original_reward()
         observations: Any = self._last_obs
@@ -198,9 +198,9 @@ class CalibratedTDC(TDC):
             self._calibrate(errors)
 
     def _prediction_errors(self, episode: Steps, info: dict[str, Any]) -> np.ndarray:
-        """Return G − Q₁ at steps of an ended episode; what comes after a time limit is in G as Q₁ has it."""
+        """Return G − Q₁ at the kept steps of an ended episode; after a time limit, G continues with Q₁."""
         rewards = np.asarray(episode.rewards)
-        if self._vec_normalize_env is not None:  # as the critics learn them
+        if self._vec_normalize_env is not None:  # the rewards from which the critics learn
             rewards = self._vec_normalize_env.normalize_reward(rewards)
         following = 0.0
         if info.get("TimeLimit.truncated", False) and getattr(self.replay_buffer, "handle_timeout_termination", True):
@@ -212,7 +212,7 @@ class CalibratedTDC(TDC):
         return returns - self._first_values(episode.observations, actions)
 
     def _first_values(self, observations: list[Any], actions: np.ndarray) -> np.ndarray:
-        """Return Q₁ (T,) of observations as the policy saw them, and actions as given to the environment."""
+        """Return Q₁, (T,), of observations as the policy saw them and actions as given to the environment."""
         return predict_quantiles(self, observations, actions)[:, 0].mean(dim=1).numpy()
 
     def _calibrate(self, errors: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""TD3, SAC and TDC with an advisory board. No algorithm changes: only who decides about an action."""
+"""TD3, SAC and TDC with an advisory board. The algorithms are unchanged, except for the choice of actions."""
 
 import inspect
 import math
@@ -21,10 +21,10 @@ class Advised(NoisyOffPolicyAlgorithm):
     """
     An off-policy algorithm whose policy has a board. :class:`~sb3_tdc.advb.BoardCallback` fills it during training.
 
-    :param formation_period: episodes before the board also acts in training; with SAC, which then explores by
+    :param formation_period: episodes before the board also acts in training; from then on, SAC explores by
         ``action_noise`` alone
-    :param args: those of the algorithm
-    :param kwargs: those of the algorithm; ``policy_kwargs`` may hold ``n_members`` (10)
+    :param args: arguments of the algorithm
+    :param kwargs: arguments of the algorithm; ``policy_kwargs`` may hold ``n_members`` (10)
     """
 
     limits: ClassVar[Limits] = {**OFF_POLICY_LIMITS, "formation_period": (0, math.inf), "n_members": (1, 256)}
@@ -35,7 +35,7 @@ class Advised(NoisyOffPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        # What ``help``, and the notebooks that ask for it, show: the arguments of the algorithm, not *args and **kwargs
+        # Make ``help`` and notebooks show the arguments of the algorithm, not *args and **kwargs
         parameters = constructor_parameters(cls)
         parameters.pop("self", None)
         in_order = sorted(parameters.values(), key=lambda p: (p.kind, p.default is not p.empty))
@@ -66,8 +66,8 @@ class AdvBTD3(Advised, TD3):
     """
     TD3 with a cooperative advisory board (AdvB-TD3, Osman et al.).
 
-    :param args: those of SB3's TD3
-    :param kwargs: those of SB3's TD3; ``formation_period``: episodes before the board also acts in training
+    :param args: arguments of SB3's TD3
+    :param kwargs: arguments of SB3's TD3; ``formation_period``: episodes before the board also acts in training
     """
 
     color: ClassVar[str | None] = "#8C564B"
@@ -80,10 +80,10 @@ class AdvBTD3(Advised, TD3):
 
 class AdvBSAC(Advised, SAC):
     """
-    SAC with the board of AdvB-TD3: nothing public describes AdvB-SAC. Its members advise their mean actions.
+    SAC with the board of AdvB-TD3, since nothing public describes AdvB-SAC. Its members propose their mean actions.
 
-    :param args: those of SB3's SAC
-    :param kwargs: those of SB3's SAC; ``formation_period``: episodes before the board also acts in training
+    :param args: arguments of SB3's SAC
+    :param kwargs: arguments of SB3's SAC; ``formation_period``: episodes before the board also acts in training
     """
 
     color: ClassVar[str | None] = "#17BECF"
@@ -96,12 +96,12 @@ class AdvBSAC(Advised, SAC):
 
 class AdvBTDC(Advised, TDC):
     """
-    TDC with the board of AdvB-TD3: members' mean actions, scored by min_i (μ_i − λσ_i) of TDC's critics.
+    TDC with the board of AdvB-TD3, whose members' mean actions are scored by min_i (μ_i − λσ_i) of TDC's critics.
 
     Its policy is a subclass of TDC's, so only the readable update is used.
 
-    :param args: those of TDC
-    :param kwargs: those of TDC; ``formation_period``: episodes before the board also acts in training
+    :param args: arguments of TDC
+    :param kwargs: arguments of TDC; ``formation_period``: episodes before the board also acts in training
     """
 
     color: ClassVar[str | None] = "#9467BD"

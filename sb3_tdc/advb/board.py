@@ -1,4 +1,4 @@
-"""A cooperative advisory board: the best actors of a training so far advise, and a critic chooses."""
+"""A cooperative advisory board: the best actors of a training so far propose actions, and a critic chooses."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,9 +11,9 @@ from torch import nn
 
 class Board(nn.Module):
     """
-    Snapshots of an actor, the best first. All of it is in its state dict.
+    Snapshots of an actor, the best first. The state dict holds the whole board.
 
-    :param actors: one for every seat, of which none is taken in the beginning
+    :param actors: one for every seat; no seat is taken at first
     """
 
     returns: th.Tensor
@@ -32,13 +32,13 @@ class Board(nn.Module):
 
     def propose(self, actor: nn.Module, test_return: float) -> int | None:
         """
-        Take a copy of an actor before the first member with a smaller return; the last of a full board leaves.
+        Insert a copy of an actor before the first member with a smaller return; the last of a full board leaves.
 
-        :param actor: whose weights are copied
-        :param test_return: its return in a test episode; none that is not finite is taken
-        :return: the seat that it gets, 0 for the best; None for none
+        :param actor: the actor whose weights are copied
+        :param test_return: its return in a test episode; an actor with a non-finite return is rejected
+        :return: the seat of the copy, 0 for the best; None if the actor gets no seat
         """
-        test_return = float(test_return)  # VecMonitor's are numbers of NumPy
+        test_return = float(test_return)  # VecMonitor's returns are NumPy numbers
         if not math.isfinite(test_return):
             return None
         taken = self.returns[: len(self)].tolist()
@@ -58,7 +58,7 @@ class Board(nn.Module):
         Return, for every observation, the action of the member whose action a critic scores highest.
 
         :param obs: (B, ...)
-        :param score: from observations and actions (B, A) to (B,)
+        :param score: the critic: maps observations and actions, (B, A), to scores, (B,)
         :return: (B, A)
         :raises ValueError: if the board has no members yet
         """

@@ -1,4 +1,4 @@
-"""Test episodes that decide about the seats of a board."""
+"""Test episodes that decide which actors are on a board."""
 
 import copy
 
@@ -12,14 +12,14 @@ from sb3_tdc.advb.policies import AdvisedPolicy
 
 class BoardCallback(BaseCallback):
     """
-    Play one deterministic test episode of the actor alone after every training episode, and propose it to the board.
+    After every training episode, plays a deterministic test episode of the actor alone, and proposes it to the board.
 
     Test episodes cost steps that ``num_timesteps`` does not count: they are logged as ``board/test_steps``.
 
-    :param eval_env: one separate environment, wrapped like that of the training; if it normalises, it is given the
-        training's statistics and leaves rewards as they are
+    :param eval_env: one separate environment, wrapped like the training environment; if it normalises, it uses the
+        training environment's statistics and does not normalise rewards
     :param verbose: 1 prints every new member
-    :raises ValueError: when training begins, if only one of the two is wrapped in ``VecNormalize``
+    :raises ValueError: when training begins, if only one of the two environments is wrapped in ``VecNormalize``
     """
 
     def __init__(self, eval_env: VecEnv, verbose: int = 0):

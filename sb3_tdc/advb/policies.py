@@ -1,4 +1,4 @@
-"""The policies of TD3, SAC and TDC with a board in their weights: it is saved, restored and opened with them."""
+"""Policies of TD3, SAC and TDC with a board among their weights, so that it is saved, resumed and loaded with them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,11 +17,11 @@ from sb3_tdc.tdc.quantiles import mean_and_std
 
 class AdvisedPolicy(BasePolicy):
     """
-    What a board adds to a policy with an actor and critics: deterministic actions are the board's.
+    Base class that adds a board to a policy with an actor and critics: the board chooses the deterministic actions.
 
     :param n_members: seats of the board
-    :param args: those of the policy
-    :param kwargs: those of the policy
+    :param args: arguments of the policy
+    :param kwargs: arguments of the policy
     """
 
     def __init__(self, *args: Any, n_members: int = 10, **kwargs: Any):
@@ -68,11 +68,11 @@ class TD3MlpPolicy(AdvisedPolicy, td3.MlpPolicy):
 
 
 class TD3CnnPolicy(AdvisedPolicy, td3.CnnPolicy):
-    """The same for images."""
+    """SB3's policy of TD3 for images, with a board."""
 
 
 class TD3MultiInputPolicy(AdvisedPolicy, td3.MultiInputPolicy):
-    """The same for ``Dict`` observations."""
+    """SB3's policy of TD3 for ``Dict`` observations, with a board."""
 
 
 class SACMlpPolicy(AdvisedPolicy, sac.MlpPolicy):
@@ -80,15 +80,15 @@ class SACMlpPolicy(AdvisedPolicy, sac.MlpPolicy):
 
 
 class SACCnnPolicy(AdvisedPolicy, sac.CnnPolicy):
-    """The same for images."""
+    """SB3's policy of SAC for images, with a board."""
 
 
 class SACMultiInputPolicy(AdvisedPolicy, sac.MultiInputPolicy):
-    """The same for ``Dict`` observations."""
+    """SB3's policy of SAC for ``Dict`` observations, with a board."""
 
 
 class RiskAdvisedPolicy(AdvisedPolicy):
-    """A board whose members are scored by quantile critics; ``lam`` is λ, which the algorithm sets when it acts."""
+    """A policy whose board is scored by quantile critics; ``lam`` is λ, which the algorithm keeps up to date."""
 
     lam: th.Tensor
 
@@ -113,8 +113,8 @@ class TDCMlpPolicy(RiskAdvisedPolicy, tdc.MlpPolicy):
 
 
 class TDCCnnPolicy(RiskAdvisedPolicy, tdc.CnnPolicy):
-    """The same for images."""
+    """The policy of TDC for images, with a board."""
 
 
 class TDCMultiInputPolicy(RiskAdvisedPolicy, tdc.MultiInputPolicy):
-    """The same for ``Dict`` observations."""
+    """The policy of TDC for ``Dict`` observations, with a board."""

@@ -1,8 +1,8 @@
 """
-What the critics of TDC predict, against the returns that follow.
+Predictions of TDC's critics, compared with the returns that follow.
 
-Shapes: ``T`` steps of an episode, ``C`` critics, ``N`` quantiles. Predictions are of the critics at the state and the
-mean action that is played.
+Shapes: ``T`` steps of an episode, ``C`` critics, ``N`` quantiles. The critics predict at the state and the mean action
+that is played.
 """
 
 import copy
@@ -24,7 +24,7 @@ def observed_frequency(quantiles: np.ndarray, returns: np.ndarray) -> np.ndarray
     """
     Return how often the return stayed at or below each predicted quantile.
 
-    Of a calibrated critic, that is as often as the quantile's level says.
+    For a calibrated critic, this frequency is the level of the quantile.
 
     :param quantiles: (T, N)
     :param returns: (T,)
@@ -36,12 +36,12 @@ def observed_frequency(quantiles: np.ndarray, returns: np.ndarray) -> np.ndarray
 @dataclass(frozen=True)
 class Episode:
     """
-    One episode and what was predicted on its way.
+    One episode and the critics' predictions along it.
 
-    :param steps: (M,), those that were looked at, in increasing order
+    :param steps: (M,), the steps at which the critics predicted, in increasing order
     :param quantiles: (M, C, N), predicted returns
-    :param selected: (M,), the critic that the target would take (Eq. 5)
-    :param returns: (M,), realised discounted returns; NaN where too much of it was not seen
+    :param selected: (M,), the critic that the target would select (Eq. 5)
+    :param returns: (M,), realised discounted returns; NaN where too much of the return was not seen
     """
 
     steps: np.ndarray
@@ -61,7 +61,7 @@ class Episode:
 
     @property
     def overestimation(self) -> np.ndarray:
-        """Return (M, C), predicted mean − realised return; NaN where that is not known."""
+        """Return (M, C), predicted mean − realised return; NaN where the return is not known."""
         return self.means - self.returns[:, None]
 
     @property
@@ -80,7 +80,7 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
 
     :param x: (T,)
     :param y: (T,)
-    :return: between −1 and 1; NaN if there are fewer than 3, or all are equal
+    :return: between −1 and 1; NaN if T < 3, or if all of ``x`` or all of ``y`` are equal
     """
     if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
         return float("nan")
@@ -89,13 +89,13 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
-    """Return ranks; equal values have the mean of theirs."""
+    """Return ranks; equal values share the mean of their ranks."""
     _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
     return (np.cumsum(counts) - (counts - 1) / 2)[places]
 
 
 def pool(episodes: Sequence[Episode]) -> Episode:
-    """Return the steps of all episodes whose returns are known, as if they were of one."""
+    """Return all steps with a known return, as if they belonged to one episode."""
     known = [np.isfinite(episode.returns) for episode in episodes]
     names = [field.name for field in fields(Episode)]
     parts = {n: [getattr(e, n)[k] for e, k in zip(episodes, known, strict=True)] for n in names}
@@ -104,12 +104,12 @@ def pool(episodes: Sequence[Episode]) -> Episode:
 
 def summarise(episodes: Sequence[Episode]) -> dict[str, float]:
     """
-    Summarise the steps of episodes, each with the same weight: a short episode must not count as a long one.
+    Summarise episodes with the same weight for every step: a short episode must not count as much as a long one.
 
     :return: ``overestimation`` (mean over steps and critics, in units of the critics' return),
         ``calibration_error`` (mean over levels and critics of |observed − nominal|, between 0 and 0.5 or so),
-        ``std_error_correlation`` and ``std_scatter_correlation``, of σ with the error and with what is left of it
-        without bias (:func:`spread_and_errors`), by ranks, means over critics; nothing where no return is known
+        ``std_error_correlation`` and ``std_scatter_correlation`` (rank correlations of σ with the error, and with the
+        error without bias, see :func:`spread_and_errors`; means over critics); empty if no return is known
     """
     pooled = pool(episodes)
     if not len(pooled.returns):
@@ -129,11 +129,11 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, float]:
 
 def spread_and_errors(pooled: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Return σ, |G − μ|, and |G − a − b·μ| with the line that fits best: the error without a bias that grows with μ.
+    Return σ, |G − μ|, and |G − a − b·μ| for the line of best fit: the error without any bias that is linear in μ.
 
-    A bias can hide what σ says, or look like it. The scatter around the line is what σ is to predict.
+    A bias can hide the information in σ, or imitate it. The scatter around the line is what σ should predict.
 
-    :param pooled: steps of known returns, M of them
+    :param pooled: M steps with known returns
     :return: each (M, C)
     """
     means, returns = pooled.means - pooled.means.mean(axis=0), (pooled.returns - pooled.returns.mean())[:, None]
@@ -142,15 +142,15 @@ def spread_and_errors(pooled: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return pooled.stds, np.abs(pooled.overestimation), np.abs(returns - slope * means)
 
 
-# The distance of the steps that critics are asked about: neighbouring steps say much the same
+# The distance between the steps at which critics predict: neighbouring steps give nearly the same information
 EVERY = 10
 
 
 class Steps:
     """
-    The rewards of an episode under way, and every few observations and actions.
+    The rewards of an episode in progress, and the observations and actions of every few steps.
 
-    :param every: the distance of the steps whose observations and actions are kept, at least 1
+    :param every: keep the observation and the action of every ``every``-th step; at least 1
     """
 
     def __init__(self, every: int = 1):
@@ -179,12 +179,13 @@ class Steps:
 
 class Recording(Steps):
     """
-    Collects the steps of an episode, and at its end asks the critics about them all at once.
+    The steps of an episode in progress; at its end, the critics predict at all of them at once.
 
-    :param model: its critics, γ and λ
-    :param every: distance of the steps to look at, at least 1; the rewards of all steps count
-    :param normalization: what turns the rewards into those that the critics were trained on, if they are not yet
-    :param time_limit: of the task, if play does not continue after it (:func:`~sb3_tdc.critics.returns.known_steps`)
+    :param model: the model whose critics, γ and λ are used
+    :param every: predict at every ``every``-th step, at least 1; the rewards of all steps count
+    :param normalization: converts the rewards to those that the critics were trained on; None if they already are
+    :param time_limit: of the task, in steps, if play does not continue after it
+        (:func:`~sb3_tdc.critics.returns.known_steps`)
     """
 
     def __init__(
@@ -195,15 +196,15 @@ class Recording(Steps):
 
     def finish(self, terminated: bool, n_shown: int | None = None) -> Episode:
         """
-        End the episode, and ask the critics about its steps.
+        End the episode, and predict at its steps.
 
         :param terminated: whether the episode ended by itself
-        :param n_shown: leave out the steps from this one on
+        :param n_shown: keep only the steps before this one; None keeps all
         """
         n_steps = len(self.rewards)
         rewards = np.asarray(self.rewards)
         if self.normalization is not None:
-            rewards = self.normalization.normalize_reward(rewards)  # as they are, if it does not normalise rewards
+            rewards = self.normalization.normalize_reward(rewards)  # unchanged if it does not normalise rewards
         returns = discounted_returns(rewards, self.model.gamma)
         returns[known_steps(n_steps, terminated, self.model.gamma, self.time_limit) :] = np.nan
         steps = np.arange(0, n_steps, self.every)
@@ -245,10 +246,10 @@ def _stack(observations: Sequence[Any]) -> Any:
 
 def record_episodes(model: TDC, env: VecEnv, n_episodes: int, limit: int | None = None) -> list[Episode]:
     """
-    Play the mean action in one environment.
+    Record episodes in which the mean action is played in one environment.
 
-    :param env: whose rewards are those that the critics were trained on
-    :param limit: leave out the steps from this one on; their rewards still count
+    :param env: an environment whose rewards are those that the critics were trained on
+    :param limit: keep only the steps before this one, in each episode; the rewards of the others still count
     """
     recording = Recording(model)
     episodes: list[Episode] = []

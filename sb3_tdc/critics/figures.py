@@ -1,4 +1,4 @@
-"""Figures of :mod:`sb3_tdc.critics.episodes`, for ``sb3-tdc enjoy --explain`` and TensorBoard."""
+"""Figures of the episodes of :mod:`sb3_tdc.critics.episodes`, for ``sb3-tdc enjoy --explain`` and TensorBoard."""
 
 import textwrap
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from sb3_tdc.tdc.lam import critical_lam
 from sb3_tdc.tdc.quantiles import quantile_midpoints
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-_STYLES = ("-", "--")  # so that critics that agree are both seen
+_STYLES = ("-", "--")  # so that both lines are visible where critics agree
 
 
 def draw_fan(axes: Any, episode: Episode, critic: int) -> None:
@@ -72,7 +72,7 @@ def draw_calibration(axes: Any, episodes: Sequence[Episode]) -> None:
 
 
 def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
-    """Draw predicted mean − realised return along the episodes, one thin line for each and critic."""
+    """Draw predicted mean − realised return along the episodes, one thin line for each episode and critic."""
     axes.axhline(0, color="grey", ls=":", lw=1)
     for critic in range(episodes[0].quantiles.shape[1]):
         color = _COLORS[critic % len(_COLORS)]
@@ -90,7 +90,7 @@ def draw_overestimation(axes: Any, episodes: Sequence[Episode]) -> None:
 
 
 def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
-    """Draw |G − μ| against σ at every step, and the mean of tenths of the steps: does σ mean uncertainty?"""
+    """Draw |G − μ| against σ at every step, and their means over tenths of the steps: does σ mean uncertainty?"""
     pooled = pool(episodes)
     known = len(pooled.returns) > 0
     of_critics = [array.T for array in spread_and_errors(pooled)] if known else [np.empty((0, 0))] * 3
@@ -109,7 +109,7 @@ def draw_spread(axes: Any, episodes: Sequence[Episode]) -> None:
 
 
 def draw_lam(axes: Any, episodes: Sequence[Episode], lam: float) -> None:
-    """Draw the share of steps at which a λ selects another critic than λ = 0 does, against that λ."""
+    """Draw, against λ, the share of steps at which it selects a different critic than λ = 0 does."""
     pairs = [th.as_tensor(np.concatenate([getattr(e, name) for e in episodes])) for name in ("means", "stds")]
     thresholds = critical_lam(*pairs).numpy()
     grid = np.linspace(0, max(2.0, 1.5 * lam), 200)
@@ -127,9 +127,9 @@ def make_figure(episodes: Sequence[Episode], title: str, lam: float, note: str =
     """
     Draw all of the above on one page.
 
-    :param lam: the model's λ now
-    :return: a figure of matplotlib
-    :raises ImportError: with the command that installs it
+    :param lam: the model's current λ
+    :return: a Matplotlib figure
+    :raises ImportError: if Matplotlib is missing, with the command that installs it
     """
     n_critics = episodes[0].quantiles.shape[1]
     rows = -(-(n_critics + 6) // 2)
@@ -151,7 +151,7 @@ def make_figure(episodes: Sequence[Episode], title: str, lam: float, note: str =
 
 
 def render(figure: Any) -> np.ndarray:
-    """Return (height, width, 3) pixels of a figure."""
+    """Return the pixels of a figure, (height, width, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)
@@ -160,7 +160,7 @@ def render(figure: Any) -> np.ndarray:
 
 
 def describe_play(model: TDC) -> str:
-    """Return what one must know to read the figures."""
+    """Return the notes that a reader of the figures needs."""
     target = "samples of the tanh-Gaussian" if model.stochastic_actor else "the mean action with smoothing noise"
     paragraphs = (
         f"Played: the mean action, without noise. The critics are trained for another policy, {target}, without "
@@ -175,7 +175,7 @@ def describe_play(model: TDC) -> str:
 
 
 def write_explanation(model: TDC, episodes: Sequence[Episode], stem: Path, title: str) -> None:
-    """Write the figure as PNG and PDF, and print what it shows in numbers."""
+    """Write the figure as PNG and PDF, and print its main numbers."""
     figure = make_figure(episodes, title, model.scheduled("lam"), describe_play(model))
     for suffix in (".png", ".pdf"):
         figure.savefig(f"{stem}{suffix}", dpi=150)

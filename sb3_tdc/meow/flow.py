@@ -1,10 +1,10 @@
 """
 The conditional normalising flow of MEOW: a Gaussian that depends on the state, shifted by couplings and squashed.
 
-The couplings are written out. zuko, the maintained library of flows for PyTorch, has additive ones
+The couplings are implemented here. zuko, the maintained library of flows for PyTorch, has additive couplings
 (``GeneralCouplingTransform`` with ``AdditiveTransform``), but its translation networks have no dropout, normalise after
-the activation and without learnable scales, and the mask of a single action leaves nothing to shift. Its inverse and
-backward pass took about twice the time of these, on one thread (``python -m benchmarks.flows``).
+the activation and without learnable scales, and with a single action its mask leaves nothing to shift. Its inverse and
+backward pass took about twice as long as these, on one thread (``python -m benchmarks.flows``).
 """
 
 import math
@@ -14,15 +14,15 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
-# Actions on the border of [-1, 1] have no inverse: their density is taken this far inside
+# Actions at ±1 have no inverse under the tanh: densities clamp actions to this magnitude
 MAX_ACTION = 1 - 1e-5
 
 
 class Swish(nn.Module):
     """
-    x·σ(βx) with a learnable β for every unit, 1 in the beginning.
+    The activation x·σ(βx) with a learnable β for every unit, initially 1.
 
-    :param shape: of the units
+    :param shape: shape of β, one value for each unit
     """
 
     def __init__(self, *shape: int):
@@ -35,7 +35,7 @@ class Swish(nn.Module):
 
 def make_zeroed_mlp(in_features: int, net_arch: Sequence[int], out_features: int) -> nn.Sequential:
     """
-    Build a network whose output is the same for every input in the beginning: its weights, but not its biases, are 0.
+    Build a network whose initial output is the same for every input: its weights, but not its biases, start at 0.
 
     :param in_features: number of inputs
     :param net_arch: units of the hidden layers
@@ -55,7 +55,7 @@ def make_zeroed_mlp(in_features: int, net_arch: Sequence[int], out_features: int
 
 class AdditiveCoupling(nn.Module):
     """
-    Shift the elements outside a mask by a function of those inside it and of the state. Its log-determinant is 0.
+    Shift of the elements outside a mask by a function of those inside it and of the state. Its log-determinant is 0.
 
     :param mask: (A,), 1 where an element stays as it is
     :param features_dim: number of features of the state
@@ -80,7 +80,7 @@ class AdditiveCoupling(nn.Module):
 
     def shift(self, z: th.Tensor, features: th.Tensor) -> th.Tensor:
         """
-        Return what is added on the way to the action; it is the same before and after it has been added.
+        Return the shift that is added on the way to the action; computed before or after the addition, it is the same.
 
         :param z: (B, A)
         :param features: (B, D)
@@ -105,8 +105,8 @@ class ConditionalFlow(nn.Module):
     """
     A density of actions in (-1, 1) for every state, exact in both directions.
 
-    z ~ N(0, diag σ(s)²) → additive couplings, two a block, with complementary masks → tanh. In training mode hidden
-    units of the couplings are dropped: an inverse belongs to the same flow only in evaluation mode.
+    z ~ N(0, diag σ(s)²) → additive couplings, two per block, with complementary masks → tanh. In training mode, dropout
+    is active in the couplings, so ``inverse`` is the inverse of ``forward`` only in evaluation mode.
 
     :param features_dim: D, number of features of the state
     :param action_dim: A
@@ -137,7 +137,7 @@ class ConditionalFlow(nn.Module):
 
     def log_std(self, features: th.Tensor) -> th.Tensor:
         """
-        Return log σ(s), of the latent Gaussian.
+        Return log σ(s) of the latent Gaussian.
 
         :param features: (B, D)
         :return: (B, A), between its limits
@@ -163,7 +163,7 @@ class ConditionalFlow(nn.Module):
 
         :param actions: (B, A), in [-1, 1]
         :param features: (B, D)
-        :return: latent variables, and the log-determinant of the way from there to the actions
+        :return: latent variables, and the log-determinant of the map from them to the actions
         """
         actions = actions.clamp(-MAX_ACTION, MAX_ACTION)
         z = th.atanh(actions)
@@ -196,7 +196,7 @@ class ConditionalFlow(nn.Module):
 
     def mode(self, features: th.Tensor) -> th.Tensor:
         """
-        Return the actions of z = 0: since couplings only shift, they have the highest density before the tanh.
+        Return the actions of z = 0. Since couplings only shift, these have the highest density before the tanh.
 
         :param features: (B, D)
         :return: (B, A), in [-1, 1]

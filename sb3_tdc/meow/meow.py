@@ -44,9 +44,9 @@ class MEOW(CheckedOffPolicyAlgorithm):
     :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
-    :param n_steps: n-step returns if > 1 (with the ``NStepReplayBuffer``)
-    :param ent_coef: α > 0, the temperature: the weight of the entropy next to rewards. It is not learned
-    :param max_grad_norm: the gradient is scaled down to this norm where it is larger
+    :param n_steps: if > 1, the target uses n-step returns (with the ``NStepReplayBuffer``)
+    :param ent_coef: α > 0, the temperature: the weight of the entropy relative to rewards. It is not learned
+    :param max_grad_norm: largest norm of the gradient; a larger gradient is scaled down to it
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``log_std_max`` (−0.3), ``net_arch`` ([64, 64]),
@@ -55,7 +55,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
     :param seed: Seed for the pseudo random generators
     :param device: Device (cpu, cuda, ...) on which the code should be run
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
-    :raises ValueError: for an argument out of range, by name, before the networks and the buffer are built
+    :raises ValueError: if an argument is out of range, with its name, before the networks and the buffer are built
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -163,8 +163,8 @@ class MEOW(CheckedOffPolicyAlgorithm):
 
         :param gradient_steps: number of updates
         :param batch_size: B, transitions per update
-        :raises ValueError: if a schedule returns something that is not allowed
-        :raises NonFiniteError: if the loss has been seen to be NaN or infinite
+        :raises ValueError: if a schedule returns a value that is not allowed
+        :raises NonFiniteError: if the loss was found to be NaN or infinite
         """
         ent_coef = check_within(self.limits, "ent_coef", self.ent_coef)
         self._pass_gamma_to_replay_buffer()

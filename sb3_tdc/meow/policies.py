@@ -22,10 +22,10 @@ from sb3_tdc.meow.flow import ConditionalFlow, Swish
 
 class SoftValues(NamedTuple):
     """
-    Values of C reward shifts, divided by the temperature α.
+    Soft values for C reward shifts, divided by the temperature α.
 
-    q: (B, C), of the actions
-    v: (B, C), of the states
+    q: (B, C), values of the actions
+    v: (B, C), values of the states
     """
 
     q: th.Tensor
@@ -83,7 +83,7 @@ class EnergyFlow(BaseModel):
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> SoftValues:
         """
-        Return soft values of states and actions: Q_i − V_i = α·log π(a|s).
+        Return the soft values of actions and states, divided by α: q_i − v_i = log π(a|s).
 
         :param obs: (B, ...) observations
         :param actions: (B, A) actions in [-1, 1]
@@ -97,7 +97,7 @@ class EnergyFlow(BaseModel):
 
     def values(self, obs: PyTorchObs) -> th.Tensor:
         """
-        Return the soft values of states, log ∫ exp(Q_i/α) da in closed form.
+        Return the soft values of states, divided by α: log ∫ exp(Q_i/α) da in closed form.
 
         :param obs: (B, ...) observations
         :return: (B, C), Σ log σ + (A/2) log 2π + b_i
@@ -125,12 +125,12 @@ class MEOWPolicy(BasePolicy):
     :param features_extractor_class: Features extractor to use
     :param features_extractor_kwargs: Keyword arguments to pass to the features extractor
     :param normalize_images: Whether to divide images by 255
-    :param optimizer_class: The optimizer, ``th.optim.Adam`` by default (then the fused one)
+    :param optimizer_class: The optimizer, ``th.optim.Adam`` by default (in its fused implementation)
     :param optimizer_kwargs: Additional keyword arguments for the optimizer, without the learning rate
     :param shift_arch: Units of the hidden layers of the reward shifts, ``[256, 256]`` by default
     :param n_shifts: Number of reward shifts; the target takes the smallest value
     :param n_blocks: Blocks of two couplings
-    :param dropout: Probability that a hidden unit of a coupling is dropped while it learns
+    :param dropout: Probability that a hidden unit of a coupling is dropped in training mode
     :param log_std_min: Lower limit of log σ(s) of the latent Gaussian
     :param log_std_max: Upper limit of log σ(s)
     """
@@ -208,7 +208,7 @@ class MEOWPolicy(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(
-            lr_schedule=self._dummy_schedule,  # of no use in a copy that only predicts
+            lr_schedule=self._dummy_schedule,  # not needed in a copy that only predicts
             net_arch=self.net_arch,
             features_extractor_class=self.features_extractor_class,
             features_extractor_kwargs=self.features_extractor_kwargs,
@@ -221,8 +221,8 @@ class MEOWPolicy(BasePolicy):
         return data
 
     def set_training_mode(self, mode: bool) -> None:
-        """Switch the flow, and never its target: a target has no dropout."""
-        # SB3 calls this at every step; walking through the modules costs more than acting
+        """Switch the mode of the flow, but never that of its target, which must not use dropout."""
+        # SB3 calls this at every step; setting the mode of all modules would cost more than acting
         if self.training != mode or self.network.training != mode:
             self.network.set_training_mode(mode)
             self.training = mode

@@ -1,4 +1,4 @@
-"""Whether there are compiled loops."""
+"""Access to the compiled loops, where Numba is available."""
 
 from functools import cache
 from types import ModuleType

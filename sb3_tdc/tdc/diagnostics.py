@@ -1,4 +1,4 @@
-"""What is measured of the critics and the networks on a minibatch; docs/tdc.md describes each number."""
+"""Measurements of the critics and the networks on a minibatch; docs/tdc.md describes each of them."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from sb3_tdc.tdc.dormant import dormant_share, relu_activations
 from sb3_tdc.tdc.lam import describe_selection
 from sb3_tdc.tdc.quantiles import Target, quantile_huber_loss
 
-# Modules of which a forward pass changes nothing
+# Modules whose forward pass changes no state
 _PLAIN = (nn.Linear, StackedLinear, nn.ReLU, nn.Tanh, nn.Flatten, nn.Sequential, nn.ModuleList, FlattenExtractor)
 
 
@@ -20,8 +20,8 @@ def describe_critics(current: th.Tensor, target: Target, kappa: float) -> dict[s
     """
     Measure the loss, the target and the selection of critics.
 
-    :param current: (B, C, N)
-    :param target: of the same minibatch
+    :param current: (B, C, N), quantiles of the critics
+    :param target: the target of the same minibatch
     :param kappa: κ
     :return: scalars by name
     """
@@ -40,11 +40,11 @@ def describe_critics(current: th.Tensor, target: Target, kappa: float) -> dict[s
 
 def describe_units(model: Any, observations: Any) -> dict[str, th.Tensor]:
     """
-    Measure the shares of dormant units: of the actor, and of the critics at its mean actions.
+    Measure the share of dormant units in the actor, and in the critics at the actor's mean actions.
 
     :param model: a :class:`~sb3_tdc.tdc.tdc.TDC`
-    :param observations: of a minibatch
-    :return: scalars by name; none if the networks have other modules than linear layers and ReLUs
+    :param observations: observations of a minibatch
+    :return: scalars by name; none unless the networks are linear layers and ReLUs on flat observations
     """
     actor, critic = model.actor, model.critic
     if not _has_plain_units(actor, critic, model.observation_space):

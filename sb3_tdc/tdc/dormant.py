@@ -1,4 +1,4 @@
-"""Dormant units: those that hardly answer to any input any more (Sokar et al., ICML 2023)."""
+"""Dormant units: units that hardly respond to any input any more (Sokar et al., ICML 2023)."""
 
 from collections.abc import Iterable
 
@@ -12,7 +12,7 @@ THRESHOLD = 0.025
 @th.no_grad()
 def relu_activations(layers: Iterable[nn.Module], inputs: th.Tensor) -> tuple[list[th.Tensor], th.Tensor]:
     """
-    Pass inputs through layers.
+    Pass inputs through layers and collect the outputs of the ReLUs.
 
     :param inputs: (B, in)
     :return: the output of every ReLU, (..., B, units), and the last output
@@ -29,8 +29,8 @@ def dormant_share(activations: Iterable[th.Tensor], threshold: float = THRESHOLD
     """
     Return the share of dormant units in some hidden layers.
 
-    :param activations: of each layer (..., B, units); leading axes are those of parallel networks
-    :return: scalar, between 0 and 1; units of a layer that is 0 everywhere are dormant
+    :param activations: activations of each layer, (..., B, units); leading axes index parallel networks
+    :return: scalar, between 0 and 1; in a layer that is 0 everywhere, all units count as dormant
     """
     dormant = []
     for layer in activations:

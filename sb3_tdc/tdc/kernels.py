@@ -1,11 +1,12 @@
 """
-Compiled loops (Numba, the extra ``[fast]``), each in place of several passes of PyTorch over memory.
+Compiled loops (Numba, the extra ``[fast]``), each of which replaces several passes of PyTorch over memory.
 
-Functions of float32 arrays, which write into the arrays given for their results. Those of the update have a twin of the
-same name and arguments in PyTorch (``fused/passes.py``). Shapes: C critics, B transitions, N quantiles, M targets, A
-action, n units of a layer. Import this module through :func:`~sb3_tdc.tdc.compiled.load_kernels`.
+The functions take float32 arrays and write their results into arguments (*written* below). Those of the fused update
+have a PyTorch twin with the same name and arguments in ``fused/passes.py``. Shapes: C critics, B transitions,
+N quantiles, M targets, A action dimensions, n units of a layer. Import this module through
+:func:`~sb3_tdc.tdc.compiled.load_kernels`.
 
-Sums may be reordered, but unlike with ``fastmath=True`` NaN and infinities are kept: what diverges must show.
+Sums may be reordered, but unlike with ``fastmath=True``, NaN and infinities are kept: a divergence must show.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -28,7 +29,7 @@ def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
     options = {"fastmath": {"contract", "nsz", "reassoc"}, "error_model": "numpy"}
     try:
         return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder for the cache can be written
+    except RuntimeError:  # Numba finds no writable folder for its cache
         return numba.njit(**options)(function)
 
 
@@ -145,7 +146,7 @@ def lcb_target(next_quantiles, rewards, dones, discounts, lam, mean, std, select
     :param lam: (1,), λ
     :param mean: (C, B), written
     :param std: (C, B), written, the population standard deviation
-    :param selected: (B,), int64, written; of equal critics the first
+    :param selected: (B,), int64, written; the first of equal critics
     :param target: (B, N), written
     """
     n_critics, batch_size, n_quantiles = next_quantiles.shape
@@ -163,7 +164,7 @@ def lcb_target(next_quantiles, rewards, dones, discounts, lam, mean, std, select
                 squares += centred * centred
             std[c, b] = math.sqrt(squares / np.float32(n_quantiles))
             score = mean[c, b] - lam[0] * std[c, b]
-            if score < smallest or (math.isnan(score) and not math.isnan(smallest)):  # as PyTorch's min
+            if score < smallest or (math.isnan(score) and not math.isnan(smallest)):  # as in PyTorch's min
                 choice, smallest = c, score
         selected[b] = choice
         factor = discounts[b, 0] * (_ONE - dones[b, 0])
@@ -174,9 +175,9 @@ def lcb_target(next_quantiles, rewards, dones, discounts, lam, mean, std, select
 @_compile
 def tanh_backward(grad_output, activation, bias_gradient):
     """
-    Take the gradient at the output of a tanh back through it, in place, and sum it over transitions.
+    Backpropagate a gradient through a tanh, in place, and sum the result over transitions.
 
-    :param grad_output: (B, A)
+    :param grad_output: (B, A), gradient at the output; becomes the gradient at the input
     :param activation: (B, A), the output of the tanh
     :param bias_gradient: (1, A), written
     """
@@ -191,7 +192,7 @@ def tanh_backward(grad_output, activation, bias_gradient):
 @_compile
 def squash(outputs, actions):
     """
-    Take the tanh in place, and copy it.
+    Apply the tanh in place, and copy the result.
 
     :param outputs: (B, A)
     :param actions: (B, A), written
@@ -259,9 +260,9 @@ def tanh_gaussian_backward(
     grad_output, ent_coef, sample, raw_log_std, scaled_noise, grad_log_std, mean_bias_gradient, log_std_bias_gradient
 ):
     """
-    Take the gradient back through a tanh-Gaussian sample, adding that of mean(α·log π) (see ``TanhGaussianHead``).
+    Backpropagate through a tanh-Gaussian sample, adding the gradient of mean(α·log π) (see ``TanhGaussianHead``).
 
-    :param grad_output: (B, A), at the actions; becomes the gradient at the mean
+    :param grad_output: (B, A), gradient at the actions; becomes the gradient at the mean
     :param ent_coef: (1,), α
     :param sample: (B, A), after the tanh
     :param raw_log_std: (B, A)
@@ -292,7 +293,7 @@ def mean_value(hidden, weight, bias, grad_hidden, values):
     Compute Q₁, the mean of the first critic's quantiles (Eq. 11), and the gradient of −mean Q₁ before the last ReLU.
 
     :param hidden: (B, n), after the ReLU
-    :param weight: (n, N), of the layer of quantiles
+    :param weight: (n, N), of the layer that outputs the quantiles
     :param bias: (1, N)
     :param grad_hidden: (B, n), written
     :param values: (B,), written
@@ -321,15 +322,15 @@ def mean_value(hidden, weight, bias, grad_hidden, values):
 @_compile
 def gather(rows, batch, drawn_next_observations, next_observations, dones, timeouts, indices):
     """
-    Gather a minibatch of packed rows, of which the other arguments are columns.
+    Gather a minibatch from packed rows, copy its next observations, and clear ``dones`` at time-outs.
 
     :param rows: (size, columns)
     :param batch: (B, columns), written
     :param drawn_next_observations: (B, D), columns of ``batch``
     :param next_observations: (B, D), written
-    :param dones: (B, 1), columns of ``batch``; those that were time-outs become 0
-    :param timeouts: (B, 1), columns of ``batch``
-    :param indices: (B,)
+    :param dones: (B, 1), a column of ``batch``; time-outs become 0
+    :param timeouts: (B, 1), a column of ``batch``
+    :param indices: (B,), the rows to gather
     """
     for b in range(batch.shape[0]):
         for k in range(batch.shape[1]):
@@ -348,7 +349,7 @@ def affine_row(inputs, weight, bias, outputs, relu):
     :param weight: (n, m)
     :param bias: (n,)
     :param outputs: (n,), written
-    :param relu: whether to take the ReLU
+    :param relu: whether to apply a ReLU
     """
     for k in range(weight.shape[0]):
         total = _ZERO

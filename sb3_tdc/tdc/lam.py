@@ -1,8 +1,8 @@
 """
-What λ does: where it changes the choice of the target critic, and what that adds to the target.
+The effect of λ: where it changes which target critic is selected, and how much that adds to the target.
 
-Let critic m have the smallest mean. λ > 0 prefers critic i where σ_i > σ_m and λ > (μ_i − μ_m)/(σ_i − σ_m). So the
-mean of the target is a non-decreasing step function of λ, from the smallest mean at λ = 0 upwards.
+Let critic m have the smallest mean. λ > 0 prefers critic i to m where σ_i > σ_m and λ > (μ_i − μ_m)/(σ_i − σ_m). So the
+mean of the target is a non-decreasing step function of λ, which starts from the smallest mean at λ = 0.
 """
 
 import torch as th
@@ -14,7 +14,7 @@ QUANTILES = (0.1, 0.5, 0.9)
 
 def critical_lam(mean: th.Tensor, std: th.Tensor) -> th.Tensor:
     """
-    Return λ*, above which another critic is selected than at λ = 0.
+    Return λ*, above which λ selects a different critic than λ = 0 does.
 
     :param mean: (B, C)
     :param std: (B, C)
@@ -28,10 +28,10 @@ def critical_lam(mean: th.Tensor, std: th.Tensor) -> th.Tensor:
 
 def describe_selection(target: Target) -> dict[str, th.Tensor]:
     """
-    Measure what λ did to a minibatch; docs/tdc.md has the equations.
+    Measure the effect of λ in a minibatch; docs/tdc.md has the equations.
 
-    :param target: of the minibatch
-    :return: scalars by name; those of λ* only where it is finite for a transition
+    :param target: the target of the minibatch
+    :return: scalars by name; the quantiles of λ* only if λ* is finite for some transition
     """
     _, mean, std, selected = target
     column = selected.unsqueeze(1)

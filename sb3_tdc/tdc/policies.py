@@ -1,4 +1,4 @@
-"""Networks of TDC-λ: SB3's own actors, and quantile critics evaluated all at once."""
+"""Networks of TDC-λ: SB3's actors, and quantile critics that are evaluated together."""
 
 import math
 from typing import Any
@@ -26,10 +26,10 @@ from sb3_tdc.common.layers import StackedLinear
 
 class QuantileCritic(ContinuousCritic):
     """
-    C critics that each predict the return as N quantiles (Eq. 3), stacked layer by layer.
+    C critics, stacked layer by layer, each of which predicts the return as N quantiles (Eq. 3).
 
-    Features extraction and its sharing rule are ``ContinuousCritic``'s. An activation with parameters
-    (``nn.PReLU``) is shared by the critics.
+    Features are extracted and shared as in ``ContinuousCritic``. The critics share an activation with
+    parameters (``nn.PReLU``).
 
     :param n_quantiles: N, quantiles per critic, at least 1
     :param n_critics: C, at least 1
@@ -103,14 +103,14 @@ class QuantileCritic(ContinuousCritic):
         return hidden.mean(dim=1, keepdim=True)
 
 
-# SB3's limits of log σ, and what its density of the tanh-Gaussian adds to 1 − a²; compiled code has them inside
+# SB3's limits of log σ, and the ε that its tanh-Gaussian density adds to 1 − a²; compiled code has them as constants
 LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON = -20.0, 2.0, 1e-6
-# Of the density of a normal distribution
+# The constant in the log density of a normal distribution
 LOG_SQRT_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 class TanhGaussian(SquashedDiagGaussianDistribution):
-    """SB3's distribution; a copy does not have the last sample, which may hold a graph of autograd."""
+    """SB3's distribution, except that copies omit the last sample, which may hold an autograd graph."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "distribution": None, "gaussian_actions": None}
@@ -128,7 +128,7 @@ class TDCPolicy(TD3Policy):
     :param features_extractor_class: Features extractor to use
     :param features_extractor_kwargs: Keyword arguments to pass to the features extractor
     :param normalize_images: Whether to divide images by 255
-    :param optimizer_class: The optimizer, ``th.optim.Adam`` by default (then the fused one)
+    :param optimizer_class: The optimizer, ``th.optim.Adam`` by default (in its fused implementation)
     :param optimizer_kwargs: Additional keyword arguments for the optimizer, without the learning rate
     :param n_critics: Number of critics C
     :param share_features_extractor: Whether the actor and the critics share one features extractor
@@ -158,7 +158,7 @@ class TDCPolicy(TD3Policy):
         n_quantiles: int = 64,
         stochastic_actor: bool = False,
     ):
-        # TD3Policy's constructor builds the networks: what they need is set first
+        # Set before the call of TD3Policy's constructor, which builds the networks
         self.n_quantiles = n_quantiles
         self.stochastic_actor = stochastic_actor
         if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
@@ -198,7 +198,7 @@ class TDCPolicy(TD3Policy):
         return data
 
     def set_training_mode(self, mode: bool) -> None:
-        # SB3 calls this at every step; walking through the modules costs more than the actor
+        # SB3 calls this at every step; setting the mode of all modules would cost more than the actor's forward pass
         if any(module.training != mode for module in (self, self.actor, self.critic)):
             super().set_training_mode(mode)
 

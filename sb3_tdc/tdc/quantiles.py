@@ -1,4 +1,4 @@
-"""The mathematics of TDC-λ on quantiles: functions of tensors that know no networks and no replay.
+"""The mathematics of TDC-λ on quantiles: functions of tensors, independent of networks and of the replay buffer.
 
 Shapes: ``B`` transitions of a minibatch, ``C`` critics, ``N`` quantiles. Equation numbers are the paper's
 (Osman et al., "Risk sensitive twin distributional critics with a lambda lower confidence bound").
@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from sb3_tdc.tdc.compiled import load_kernels
 
-# The all-pairs differences of one chunk of rows: this many floats (1 MiB). Smaller chunks cost more calls, larger ones
-# gain nothing.
+# Number of floats in the all-pairs differences of one chunk of rows (1 MiB). Smaller chunks need more calls; larger
+# ones are not faster.
 _CHUNK_ELEMENTS = 2**18
 
 
@@ -43,13 +43,13 @@ def mean_and_std(quantiles: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
 def select_critic(mean: th.Tensor, std: th.Tensor, lam: th.Tensor | float) -> th.Tensor:
     """
-    Return the critic with the smallest mean − λ·std, per transition (Eq. 5). Of equal critics, the first.
+    Return, per transition, the critic with the smallest mean − λ·std (Eq. 5), the first of equal ones.
 
     :param mean: (B, C)
     :param std: (B, C)
     :return: (B,) indices
     """
-    return (mean - lam * std).min(dim=1).indices  # the first of equal ones, like argmin, in a sixth of its time
+    return (mean - lam * std).min(dim=1).indices  # the same index as argmin, in a sixth of the time
 
 
 def take_critic(quantiles: th.Tensor, index: th.Tensor) -> th.Tensor:
@@ -74,7 +74,7 @@ def td_target(
     :param discounts: γ, or (B, 1) for n-step returns
     :param next_quantiles: (B, N)
     :return: (B, N)
-    :raises ValueError: if a column is not (B, 1): broadcasting (B,) against (B, N) would mix transitions
+    :raises ValueError: if rewards, dones or discounts are not (B, 1): broadcasting (B,) to (B, N) would mix transitions
     """
     column = (next_quantiles.shape[0], 1)
     for name, tensor in (("rewards", rewards), ("dones", dones), ("discounts", discounts)):
@@ -88,9 +88,9 @@ class Target(NamedTuple):
     The λ-LCB target of a minibatch.
 
     :param quantiles: (B, N), y_j (Eq. 7)
-    :param mean: (B, C), of the target critics (Eq. 4)
-    :param std: (B, C)
-    :param selected: (B,), indices of critics (Eq. 5)
+    :param mean: (B, C), means of the target critics (Eq. 4)
+    :param std: (B, C), their population standard deviations (Eq. 4)
+    :param selected: (B,), indices of the selected critics (Eq. 5)
     """
 
     quantiles: th.Tensor
@@ -107,14 +107,14 @@ def lcb_target(
     lam: th.Tensor | float,
 ) -> Target:
     """
-    Return the λ-LCB target: that of the critic with the smallest mean − λ·std, per transition (Eq. 4–7).
+    Return the λ-LCB target: per transition, that of the critic with the smallest mean − λ·std (Eq. 4–7).
 
     :param next_quantiles: (B, C, N), of the target critics at (s', ã)
     :param rewards: (B, 1)
     :param dones: (B, 1)
     :param discounts: γ, or (B, 1)
     :param lam: λ ≥ 0
-    :raises ValueError: if a column is not (B, 1)
+    :raises ValueError: if rewards, dones or discounts are not (B, 1)
     """
     mean, std = mean_and_std(next_quantiles)
     selected = select_critic(mean, std, lam)
@@ -130,21 +130,21 @@ def _check_shapes(current: th.Tensor, target: th.Tensor) -> None:
 
 
 def _row_chunks(n_rows: int, pairs: int) -> list[slice]:
-    """Return slices of rows whose all-pairs differences fit the cache together."""
+    """Return slices of rows, each with all-pairs differences that fit into the cache."""
     size = max(1, _CHUNK_ELEMENTS // pairs)
     return [slice(i, min(i + size, n_rows)) for i in range(0, n_rows, size)]
 
 
 class QuantileHuberGradient:
     """
-    Compute :func:`quantile_huber_gradient` of two preallocated tensors, in closed passes over one small buffer.
+    :func:`quantile_huber_gradient` of two preallocated tensors, in closed form, with one small buffer for all chunks.
 
-    With c = clamp(y_j − z_k, ±κ) (for κ = 0 the sign), the derivative of ρ at z_k summed over the targets is
+    With c = clamp(y_j − z_k, ±κ) (the sign for κ = 0), the derivative of ρ at z_k summed over the targets is
     ½·((1 − 2τ_k)·Σ_j |c| − Σ_j c). Autograd through all pairs would take most of the time of an update.
 
-    :param current: (C, B, N), read by each call
-    :param target: (B, M), read by each call
-    :param out: (C, B, N), where it is written, if given
+    :param current: (C, B, N), read at each call
+    :param target: (B, M), read at each call
+    :param out: (C, B, N), buffer for the gradient; None to allocate one
     """
 
     def __init__(self, current: th.Tensor, target: th.Tensor, out: th.Tensor | None = None):
@@ -154,7 +154,7 @@ class QuantileHuberGradient:
         self.weight = (1 - 2 * quantile_midpoints(n_quantiles, current.device).to(current.dtype)) * scale
         self.scale = scale
         chunks = _row_chunks(batch_size, n_quantiles * n_targets)
-        # [row, j, k]: sums over j run along the memory
+        # Axes [row, j, k]: a sum over j reads the memory in order
         delta = current.new_empty(chunks[0].stop, n_targets, n_quantiles)
         self.chunks = [
             (y, z, delta[: len(y)], self.total[critic, rows], self.size[critic, rows])
@@ -164,7 +164,7 @@ class QuantileHuberGradient:
         ]
 
     def __call__(self, kappa: float) -> th.Tensor:
-        """Return (C, B, N), overwritten by the next call."""
+        """Return the gradient, (C, B, N), which the next call overwrites."""
         for y, z, delta, total, size in self.chunks:
             th.sub(y, z, out=delta)  # Eq. 8
             clamped = delta.clamp_(-kappa, kappa) if kappa > 0 else delta.sign_()
@@ -174,7 +174,7 @@ class QuantileHuberGradient:
 
 
 def _find_kernels(*tensors: th.Tensor) -> ModuleType | None:
-    """Return the compiled loops, if there are any and they are for these tensors."""
+    """Return the compiled loops, or None if there are none or the tensors are not float32 on the CPU."""
     fit = all(tensor.device.type == "cpu" and tensor.dtype == th.float32 for tensor in tensors)
     return load_kernels() if fit else None
 
@@ -216,7 +216,7 @@ class _QuantileHuberLoss(th.autograd.Function):
         for chunk in chunks:
             y, z = target_rows[chunk, None, :], rows[chunk, :, None]
             for near, far, total in ((z, y, sums[0]), (y, z, sums[1])):
-                d = th.sub(far, near, out=distance[: len(z)]).clamp_(min=0)  # Eq. 8: |δ| above, then below
+                d = th.sub(far, near, out=distance[: len(z)]).clamp_(min=0)  # Eq. 8: |δ| for δ > 0, then for δ < 0
                 if kappa > 0:  # L_κ = c·(|δ| − c/2) with c = min(|δ|, κ)
                     c = th.clamp(d, max=kappa, out=clamped[: len(z)])
                     d.sub_(c, alpha=0.5).mul_(c)
@@ -239,11 +239,11 @@ def quantile_huber_loss(current: th.Tensor, target: th.Tensor, kappa: float = 1.
     Return the quantile-Huber loss over all pairs of current and target quantiles (Eq. 8–10).
 
     δ_kj = y_j − z_k, ρ = |τ_k − 1{δ<0}|·L_κ(δ), L_κ(δ) = δ²/2 for |δ| ≤ κ, else κ(|δ| − κ/2); for κ = 0, |δ|.
-    Mean over pairs and transitions, summed over critics, not divided by κ. Differentiable in ``current``, once;
-    ``target`` is a constant.
+    Mean over pairs and transitions, summed over critics, not divided by κ. Differentiable once, with respect
+    to ``current``; ``target`` is a constant.
 
     :param current: (B, C, N) quantiles z_k at the levels of :func:`quantile_midpoints`
-    :param target: (B, M) targets y_j, for all critics the same
+    :param target: (B, M) targets y_j, the same for all critics
     :param kappa: κ ≥ 0, in units of return
     :return: scalar, in units of return squared (for κ = 0, of return)
     :raises ValueError: if the shapes do not fit, or the target requires a gradient

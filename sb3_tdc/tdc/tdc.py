@@ -34,15 +34,16 @@ from sb3_tdc.tdc.quantiles import Target, lcb_target, quantile_huber_gradient
 
 SelfTDC = TypeVar("SelfTDC", bound="TDC")
 
-# The critics' diagnostics (docs/tdc.md) are taken at every fiftieth update: at every one they would slow it down. The
-# first update is one of them, so that the first line of a log has them
+# The critics' diagnostics (docs/tdc.md) are computed at every fiftieth update only: at every update they would slow
+# training down. The first update is included, so that the first line of a log has them
 DIAGNOSTICS_INTERVAL = 50
-# Dormant units (docs/tdc.md) need forward passes, and change slowly. Those of new networks say nothing: the first are
-# counted after so many updates
+# Counting dormant units (docs/tdc.md) needs extra forward passes, and their number changes slowly. The number in new
+# networks says nothing, so the first count comes after this many updates
 UNITS_INTERVAL = 500
 
-# Where the gradient stays zero (dead ReLUs), Adam's moments decay into denormal numbers and never leave them: 0.9 times
-# the smallest one is rounded to itself. Intel's processors compute with them many times slower. Next to ε they are 0
+# Where the gradient stays zero (dead ReLUs), Adam's moments decay to denormal numbers and never reach 0: 0.9 times the
+# smallest denormal rounds to itself. Intel's processors are many times slower with denormals. Compared with Adam's ε,
+# they are as good as 0
 FLUSH_INTERVAL, SMALLEST_MOMENT = 500, 1e-30
 
 
@@ -50,8 +51,8 @@ class TDC(FusedUpdateAlgorithm):
     """
     Twin Distributional Critics with a λ-lower confidence bound (TDC-λ), Osman et al.
 
-    TD3 with quantile critics: the target is taken, per transition, from the target critic with the smaller
-    mean − λ·std of its quantiles, and the head may be deterministic (TD3's) or tanh-Gaussian (SAC's).
+    TD3 with quantile critics. Per transition, the target comes from the target critic with the smallest
+    mean − λ·std of its quantiles. The actor's head is deterministic (as in TD3) or tanh-Gaussian (as in SAC).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: The environment to learn from (if registered in Gym, can be str)
@@ -70,23 +71,23 @@ class TDC(FusedUpdateAlgorithm):
     :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``)
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer
-    :param n_steps: n-step returns if > 1 (with the ``NStepReplayBuffer``)
+    :param n_steps: if > 1, the target uses n-step returns (with the ``NStepReplayBuffer``)
     :param lam: λ ≥ 0, the weight of the spread in the selection of the target critic (Eq. 5), or a schedule. λ only
         selects; 0 takes the smaller mean (TD3's clipped double), and a larger λ never gives a smaller target mean
     :param stochastic_actor: ζ: a tanh-Gaussian head trained with entropy (True), or a deterministic one (False).
-        Exploration and evaluation use the mean action with both
-    :param qf_learning_rate: η_Q, learning rate of the critics, or a schedule; None: as ``learning_rate``
+        Exploration and evaluation use the mean action with either head
+    :param qf_learning_rate: η_Q, learning rate of the critics, or a schedule; None: the same as ``learning_rate``
     :param kappa: κ ≥ 0, threshold of the quantile-Huber loss, in units of return; 0: plain quantile regression
     :param policy_delay: d, updates of the critics per update of the actor and the targets
     :param target_policy_noise: σ_tgt, standard deviation of the target policy smoothing noise (deterministic head),
         in normalised action units
-    :param target_noise_clip: c, its limit, in normalised action units
-    :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` from 0.1 on,
-        a number fixes it
+    :param target_noise_clip: c, the limit of that noise, in normalised action units
+    :param ent_coef: α, temperature (stochastic head): ``"auto"`` learns it, ``"auto_0.1"`` learns it
+        from an initial 0.1, a number fixes it
     :param target_entropy: H_target for a learned temperature; ``"auto"`` is −dim(A)
     :param fused: whether to use the fused update (the same update on preallocated buffers, faster). None: where it
-        applies (plain ReLU networks, flat observations, Adam, on the CPU). True: required, also on CUDA, where it uses
-        CUDA graphs. False: never
+        applies (plain ReLU networks, flat observations, Adam, on the CPU). True: always, also on CUDA, where it uses
+        CUDA graphs; an error where it does not apply. False: never
     :param stats_window_size: Window size, in episodes, of the rollout statistics
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments of the policy: ``n_quantiles`` (N_q, 64), ``n_critics`` (2),
@@ -95,7 +96,7 @@ class TDC(FusedUpdateAlgorithm):
     :param seed: Seed for the pseudo random generators
     :param device: Device (cpu, cuda, ...) on which the code should be run
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
-    :raises ValueError: for an argument out of range, by name, before the networks and the buffer are built
+    :raises ValueError: if an argument is out of range, with its name, before the networks and the buffer are built
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -121,7 +122,7 @@ class TDC(FusedUpdateAlgorithm):
         "target_entropy": SavedField(text_or_number),
         "fused": SavedField(or_none(boolean), is_required=False),
         "_built_stochastic_actor": SavedField(boolean, is_required=False),
-        # Where there is a temperature, it is a tensor, and elsewhere in the file
+        # None here: the tensors of a temperature are stored elsewhere in the file
         "log_ent_coef": SavedField(none, is_required=False),
         "ent_coef_optimizer": SavedField(none, is_required=False),
         "ent_coef_tensor": SavedField(none, is_required=False),
@@ -207,7 +208,7 @@ class TDC(FusedUpdateAlgorithm):
         self.target_noise_clip = target_noise_clip
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
-        # As in SAC: None where the temperature is not learned, or not fixed
+        # As in SAC: the first two are None unless the temperature is learned, the third unless it is fixed
         self.log_ent_coef: Any = None
         self.ent_coef_optimizer: Any = None
         self.ent_coef_tensor: Any = None
@@ -241,7 +242,7 @@ class TDC(FusedUpdateAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        # The user's policy_kwargs stay theirs: SB3 compares them when a model is loaded
+        # Only the policy gets stochastic_actor: SB3 compares the user's policy_kwargs when a model is loaded
         policy_kwargs = self.policy_kwargs
         self.policy_kwargs = {**policy_kwargs, "stochastic_actor": self.stochastic_actor}
         super()._setup_model()
@@ -282,7 +283,7 @@ class TDC(FusedUpdateAlgorithm):
         )
 
     def _renew_temperature(self) -> None:
-        """Make the temperature that ``ent_coef`` asks for, where it has been changed."""
+        """Build the temperature again if ``ent_coef`` has changed since it was built."""
         if self.ent_coef != self._built_ent_coef:
             self._setup_temperature()
 
@@ -290,12 +291,12 @@ class TDC(FusedUpdateAlgorithm):
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """
-        Do ``gradient_steps`` iterations of Algorithm 1, by :meth:`update` or its fused twin.
+        Run ``gradient_steps`` iterations of Algorithm 1, with :meth:`update` or its fused twin.
 
         :param gradient_steps: number of updates
         :param batch_size: B, transitions per update
-        :raises ValueError: if a schedule returns something that is not allowed
-        :raises NonFiniteError: if a loss has been seen to be NaN or infinite
+        :raises ValueError: if a schedule returns a value that is not allowed
+        :raises NonFiniteError: if a loss was found to be NaN or infinite
         """
         lam = self.scheduled("lam")
         self._pass_gamma_to_replay_buffer()
@@ -310,14 +311,14 @@ class TDC(FusedUpdateAlgorithm):
             if fused_update is None:
                 self.update(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env), lam)
             else:
-                fused_update.step(lam)  # the same
+                fused_update.step(lam)  # the same computation
             if self._n_updates % FLUSH_INTERVAL == 0:
                 self._flush_moments()
         self._record_training()
 
     def update(self, replay_data: ReplayBufferSamples, lam: float) -> None:
         """
-        Do one iteration of Algorithm 1.
+        Run one iteration of Algorithm 1.
 
         :param replay_data: a minibatch
         :param lam: λ
@@ -337,7 +338,7 @@ class TDC(FusedUpdateAlgorithm):
             target = self.make_target(next_quantiles, replay_data, lam)
         current_quantiles = self.critic(replay_data.observations, replay_data.actions)
 
-        # Only the gradient of the loss (Eq. 8–10) is needed to learn
+        # Learning needs only the gradient of the loss (Eq. 8–10), not its value
         grad_output = quantile_huber_gradient(current_quantiles, target.quantiles, self.kappa)
         self._minimize(current_quantiles, self.critic.optimizer, grad_output)
         if self.diagnoses_critics:
@@ -379,7 +380,7 @@ class TDC(FusedUpdateAlgorithm):
         """
         Take one step of the temperature, if it is learned (Eq. 14).
 
-        :param log_prob: (B,), of the actor's update
+        :param log_prob: (B,), log π of the actions in the actor's update
         :param ent_coef: (1,), α of the actor's update
         :param actor_loss: scalar, for the log
         """
@@ -392,7 +393,7 @@ class TDC(FusedUpdateAlgorithm):
             self.ent_coef_optimizer.step()
 
     def current_ent_coef(self) -> th.Tensor:
-        """Return (1,), α."""
+        """Return α, (1,)."""
         return self.log_ent_coef.detach().exp() if self._learns_ent_coef else self.ent_coef_tensor
 
     @property
@@ -418,12 +419,12 @@ class TDC(FusedUpdateAlgorithm):
 
     @staticmethod
     def _minimize(output: th.Tensor, optimizer: th.optim.Optimizer, grad_output: th.Tensor | None = None) -> None:
-        """Take one step down a loss: the output itself, or the loss whose gradient at the output is ``grad_output``."""
+        """Take one step on a loss: the output itself, or the loss with the gradient ``grad_output`` at the output."""
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         learning = [parameter for parameter in parameters if parameter.requires_grad]
         for parameter in parameters:
             parameter.grad = None
-        # Gradients of these parameters alone: others stay as they are, and cost nothing
+        # Only the gradients of these parameters: others stay as they are, and cost nothing
         if learning:
             output.backward(grad_output, inputs=learning)
         optimizer.step()
@@ -436,7 +437,7 @@ class TDC(FusedUpdateAlgorithm):
             update_learning_rate(self.ent_coef_optimizer, learning_rate)
 
     def _flush_moments(self) -> None:
-        """Set moments of Adam to zero that are about to become denormal numbers."""
+        """Set those moments of Adam to zero that are about to become denormal numbers."""
         optimizers: list[Any] = [self.actor.optimizer, self.critic.optimizer]
         if self.stochastic_actor and self._learns_ent_coef:
             optimizers.append(self.ent_coef_optimizer)
@@ -461,28 +462,28 @@ class TDC(FusedUpdateAlgorithm):
 
     @property
     def diagnoses_critics(self) -> bool:
-        """Return whether this is an update at which the critics' diagnostics are taken."""
+        """Return whether the critics' diagnostics are computed at this update."""
         return self._n_updates % DIAGNOSTICS_INTERVAL == 1
 
     @property
     def diagnoses_units(self) -> bool:
-        """Return whether this is an update after which dormant units are counted."""
+        """Return whether dormant units are counted after this update."""
         return self._n_updates % UNITS_INTERVAL == 0
 
     def diagnose_critics(self, current: th.Tensor, target: Target) -> None:
         """
-        Take the diagnostics of the critics into the log.
+        Add the critics' diagnostics to the log.
 
-        :param current: (B, C, N)
-        :param target: of the same minibatch
+        :param current: (B, C, N), quantiles of the critics
+        :param target: the target of the same minibatch
         """
         self.diagnose(**describe_critics(current, target, self.kappa))
 
     def diagnose_units(self, replay_data: ReplayBufferSamples) -> None:
         """
-        Take the shares of dormant units into the log.
+        Add the shares of dormant units to the log.
 
-        :param replay_data: a minibatch, whose observations count
+        :param replay_data: a minibatch, of which only the observations are used
         """
         self.diagnose(**describe_units(self, replay_data.observations))
 
@@ -515,10 +516,10 @@ class TDC(FusedUpdateAlgorithm):
         :param env: the environment to train on; None if only predictions are needed
         :param device: device on which the code should run
         :param custom_objects: objects that replace those in the file, by name
-        :param print_system_info: whether to print the system of the saved model, and this one
+        :param print_system_info: whether to print the system information of the saved model and of the current system
         :param force_reset: whether to reset the environment before training
-        :param kwargs: attributes to set over the file's; another ``ent_coef`` than the file's also replaces its
-            temperature
+        :param kwargs: attributes that override the file's; an ``ent_coef`` that differs from the file's also replaces
+            its temperature
         """
         given = {**(custom_objects or {}), **kwargs}
         custom_objects, kwargs = (
@@ -550,5 +551,5 @@ class TDC(FusedUpdateAlgorithm):
 
 
 def _parameters(networks: tuple[nn.Module, ...]) -> list[th.Tensor]:
-    """Return the parameters of networks, each once: actor and critics share those of a common features extractor."""
+    """Return the parameters of networks without duplicates: actor and critics may share a features extractor."""
     return list({id(parameter): parameter for network in networks for parameter in network.parameters()}.values())

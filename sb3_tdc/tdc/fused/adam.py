@@ -1,4 +1,4 @@
-"""Adam and Polyak averaging, one call each for all parameters of a network."""
+"""Adam and Polyak averaging, each in one call for all parameters of a network."""
 
 from typing import Any
 
@@ -10,12 +10,12 @@ from sb3_tdc.tdc.fused.scalar import Scalar
 
 class AdamStep:
     """
-    Steps of a network's optimizer, on the state of that optimizer, and of its target network.
+    Adam steps of a network, on the state of its own optimizer, and Polyak steps of its target network.
 
-    The gradients are preallocated, and are the ``grad`` of the parameters.
+    The gradients are preallocated; :meth:`show_gradients` makes them the ``grad`` of the parameters.
 
-    :param network: with a plain Adam as ``optimizer``
-    :param target: of the same structure
+    :param network: a network with a plain Adam as its ``optimizer``
+    :param target: a network of the same structure
     """
 
     def __init__(self, network: Any, target: nn.Module):
@@ -31,12 +31,12 @@ class AdamStep:
                 step.copy_(state["step"])
             else:
                 state.update(exp_avg=th.zeros_like(value), exp_avg_sq=th.zeros_like(value))
-            state["step"] = step  # a view, so that one addition counts them all
+            state["step"] = step  # a view, so that one addition increments all of them
         means, squares = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
         self.tensors: Any = self.values, self.gradients, means, squares, [], list(self.steps)
 
     def read_learning_rate(self) -> None:
-        """Take the learning rate of the optimizer for the next steps."""
+        """Read the optimizer's learning rate for the next steps."""
         self.learning_rate.set(self.group["lr"])
 
     def step(self) -> None:
@@ -54,7 +54,7 @@ class AdamStep:
         )
 
     def show_gradients(self) -> None:
-        """Let each parameter's ``grad`` be its gradient again, if it has been set to None."""
+        """Make each parameter's ``grad`` its preallocated gradient, where it is None or another tensor."""
         if self.parameters[0].grad is not self.gradients[0]:
             for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
                 parameter.grad = gradient

@@ -1,4 +1,4 @@
-"""Which update trains a model and chooses its actions: the readable one, or the fused one where it applies."""
+"""The choice of the update that trains a model and computes its actions: the fused one where it applies."""
 
 from typing import Any, ClassVar
 
@@ -9,7 +9,7 @@ from sb3_tdc.common.versions import numba_version
 from sb3_tdc.tdc.fused.applicability import obstacles
 from sb3_tdc.tdc.fused.update import FusedUpdate
 
-# Methods whose work the fused update does itself
+# Methods that the fused update does not call, because it does their work itself
 _FUSED_METHODS = (
     *("train", "update", "update_critics", "update_actor", "update_targets"),
     *("_sample_target_actions", "make_target", "_minimize", "predict"),
@@ -20,12 +20,12 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
     """
     An algorithm with a readable update, and with the same update on preallocated buffers (:class:`FusedUpdate`).
 
-    The direct subclass, TDC, has the readable update. Where a class below it, or an instance, overrides one of the
+    The direct subclass, TDC, implements the readable update. If a subclass of TDC, or an instance, overrides one of the
     methods that the fused update does not call, the readable update is used.
     """
 
     fused: bool | None
-    # Those of the direct subclass, as they were when it was defined
+    # These methods of the direct subclass, as they were when it was defined
     _readable_methods: ClassVar[dict[str, Any]]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -34,7 +34,7 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
             cls._readable_methods = {name: getattr(cls, name) for name in _FUSED_METHODS}
 
     def overridden_methods(self) -> list[str]:
-        """Return the methods, replaced on the class or on this instance, that the fused update would not call."""
+        """Return the methods that the class or this instance overrides and that the fused update would not call."""
         cls, attributes = type(self), vars(self)
         own = self._readable_methods
         return [name for name in own if getattr(cls, name) is not own[name] or name in attributes]
@@ -48,7 +48,7 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
             self._tell_which_update()
 
     def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
-        """Return the fused update, bound again if anything has changed, or None where the readable one is used."""
+        """Return the fused update, bound again if anything has changed, or None if the readable one is to be used."""
         bound = self._fused_update
         if bound is not None and self.fused is not False and bound.fits(batch_size):
             return bound
@@ -75,7 +75,7 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
 
     def prepare_to_continue(self) -> None:
         if self._n_updates > 0:
-            self._bind_fused_update(self.batch_size)  # it also chooses the actions
+            self._bind_fused_update(self.batch_size)  # it also computes the actions
 
     def _sample_scaled_action(self, learning_starts: int, n_envs: int) -> np.ndarray:
         fused = self._fused_update

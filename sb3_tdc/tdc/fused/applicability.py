@@ -1,4 +1,4 @@
-"""Where the fused update applies: nothing that it computes by itself is other than SB3's, PyTorch's and TDC's own."""
+"""Where the fused update applies: all that it computes itself must be unmodified code of SB3, PyTorch and TDC."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -24,7 +24,7 @@ from sb3_tdc.tdc.policies import (
     TDCPolicy,
 )
 
-th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first of a class wraps the class's step
+th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first optimizer of a class wraps the class's step
 
 _DENSITY = ("proba_distribution", "log_prob", "sample", "mode")
 # Methods whose work the fused update does itself, as they were when this module was imported: class → name → function
@@ -54,10 +54,10 @@ _GLOBAL_HOOKS: list[dict[int, Any]] = [
 
 def obstacles(model: Any) -> list[str]:
     """
-    Return what stands in the way of the fused update.
+    Return the reasons why the fused update does not apply to a model.
 
     :param model: a :class:`~sb3_tdc.tdc.tdc.TDC`
-    :return: sentences; none where it applies
+    :return: a phrase for each reason; none where it applies
     """
     policy, space = model.policy, model.observation_space
     found = [f"{name} is overridden" for name in model.overridden_methods()]
@@ -78,7 +78,7 @@ def obstacles(model: Any) -> list[str]:
     found += [text for name, network in networks.items() for text in _network_obstacles(name, network)]
     if not found:
         found += [text for name, network in targets.items() for text in _network_obstacles(name, network)]
-    if not found:  # the structure is known
+    if not found:  # the structure is known, so the parameters can be compared
         found += [text for name in networks for text in _parameter_obstacles(name, policy)]
     for name, network in networks.items():
         if not is_plain_adam(network.optimizer):
@@ -93,7 +93,7 @@ def obstacles(model: Any) -> list[str]:
 
 
 def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
-    """Yield what is not a ReLU network of the known kind."""
+    """Yield the reasons why a network is not one of the known ReLU networks."""
     if type(network) not in (DeterministicActor, TanhGaussianActor, QuantileCritic):
         yield f"the {name} is a custom class, {type(network).__qualname__}"
         return
@@ -114,17 +114,17 @@ def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
 
 
 def constants_of(distribution: Any) -> tuple[float, ...]:
-    """Return SB3's numbers in the density of its tanh-Gaussian, of the module and of the object."""
+    """Return the constants of SB3's tanh-Gaussian density: the limits of log σ in SB3's module, and the object's ε."""
     return sac_policies.LOG_STD_MIN, sac_policies.LOG_STD_MAX, distribution.epsilon
 
 
 def _replaced_methods(instance: Any) -> list[str]:
-    """Return the methods of a class that are others on this instance."""
+    """Return the names of methods of a class that are replaced on this instance."""
     return [name for name in vars(instance) if callable(getattr(type(instance), name, None))]
 
 
 def _stacks(network: Any) -> list[Any] | None:
-    """Return the linear layers of a network in the order of its forward pass, or None if there is anything else."""
+    """Return the linear layers of a network in the order of its forward pass, or None if it has another structure."""
     if type(network) is QuantileCritic:
         return _linear_layers(list(network.layers), StackedLinear, [])
     if type(network) is DeterministicActor:
@@ -176,7 +176,7 @@ def _is_plain(parameter: Any) -> bool:
 
 
 def is_plain_adam(optimizer: Any) -> bool:
-    """Return whether a step of this optimizer is one of Adam, without extras."""
+    """Return whether a step of this optimizer is a plain one of Adam, without options such as weight decay."""
     if type(optimizer) is not th.optim.Adam or len(optimizer.param_groups) != 1 or "step" in vars(optimizer):
         return False
     group = optimizer.param_groups[0]

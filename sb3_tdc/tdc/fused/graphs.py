@@ -1,4 +1,4 @@
-"""Functions of static tensors as CUDA graphs: launched as one, without Python in between."""
+"""CUDA graphs of functions of static tensors: each is launched at once, without Python in between."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,10 +10,10 @@ _WARM_UP_CALLS = 3  # libraries choose kernels and allocate workspaces in the fi
 
 class CudaGraphs:
     """
-    Call a function as it is a few times, then capture it, then replay what was captured.
+    A caller that runs a function directly a few times, then captures it as a graph, and replays it from then on.
 
-    A function must read and write the same tensors each time, decide nothing on their values, and not wait for the
-    device. What it returns is overwritten by its next call. Numbers that it reads from Python stay as captured.
+    A function must read and write the same tensors each time, must not branch on their values, and must not wait for
+    the device. The next call overwrites its result. Python numbers that it reads keep their values from the capture.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """
 Forward and hand-derived backward passes of ReLU networks, on preallocated buffers.
 
-Shapes: C critics, B transitions, A action.
+Shapes: C critics, B transitions, A action dimensions.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ class Layer:
         return Layer(self.weight[0], self.bias[0])
 
     def forward(self, inputs: th.Tensor, output: th.Tensor) -> Callable[[], Any]:
-        """Return the product that writes the output."""
+        """Return a function that computes the output."""
         return partial(self.affine, self.bias, inputs, self.weight, out=output)
 
 
@@ -40,7 +40,7 @@ def make_layers(parameters: list[th.Tensor]) -> list[Layer]:
     """
     Return the layers of a network.
 
-    :param parameters: of ``nn.Linear`` (out, in) or of ``StackedLinear`` (C, in, out), weight and bias in turn
+    :param parameters: weights and biases in turn, of ``nn.Linear`` (out, in) or ``StackedLinear`` (C, in, out)
     """
     return [
         Layer(*((w, b) if w.ndim == 3 else (w.mT, b.unsqueeze(0))))
@@ -52,15 +52,16 @@ class Mlp:
     """
     Forward and backward passes of linear layers with ReLU between them.
 
-    Before a backward pass, the caller writes the gradient of the loss at the output of the last layer (before a
-    ReLU there) into ``grad_outputs[-1]``, and its sum over transitions into the gradient of that layer's bias.
+    Before a backward pass, the caller writes the gradient of the loss at the output of the last layer (before its
+    ReLU, if it has one) into ``grad_outputs[-1]``, and its sum over transitions into the gradient of that layer's bias.
 
-    :param layers: of the network
+    :param layers: layers of the network
     :param inputs: (B, in), filled before each pass
-    :param gradients: where a backward pass writes those of the parameters; None to go without
+    :param gradients: buffers for the gradients of the parameters; None to compute none
     :param activate_output: whether there is a ReLU after the last layer too
     :param outputs: buffers for the outputs of the layers
-    :param grad_outputs: buffers for the gradients of the loss there; those of finished passes keep the cache small
+    :param grad_outputs: buffers for the gradients of the loss at these outputs; those of finished passes may be reused,
+        which saves cache
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Mlp:
         self.outputs = outputs
         self.grad_outputs = [th.empty_like(output) for output in outputs] if grad_outputs is None else grad_outputs
         all_inputs = [inputs.expand(*stacked, -1, -1), *outputs[:-1]]
-        # Every product and pass with all its tensors, so that none is looked up or viewed again
+        # Bind every product and pass to its tensors once, so that none is looked up or viewed again
         self.products = [
             layer.forward(layer_inputs, output)
             for layer, layer_inputs, output in zip(layers, all_inputs, outputs, strict=True)
@@ -108,7 +109,7 @@ class Mlp:
         ]
 
     def forward(self) -> th.Tensor:
-        """Return the output, (B, out) or (C, B, out), overwritten by the next pass."""
+        """Compute and return the output, (B, out) or (C, B, out), which the next pass overwrites."""
         for product, relu in zip(self.products, self.relus, strict=True):
             product()
             if relu is not None:
@@ -116,7 +117,7 @@ class Mlp:
         return self.outputs[-1]
 
     def backward(self) -> th.Tensor:
-        """Return the gradient of the loss at the output of the first layer, before its ReLU."""
+        """Compute all gradients, and return that of the loss at the output of the first layer, before its ReLU."""
         for i in reversed(range(len(self.grad_outputs))):
             if self.weight_products:
                 self.weight_products[i]()
@@ -126,7 +127,7 @@ class Mlp:
         return self.grad_outputs[0]
 
     def backward_relu(self, i: int) -> None:
-        """Take the gradient at the output of a layer back through its ReLU, and compute that of its bias."""
+        """Backpropagate the gradient at the output of layer ``i`` through its ReLU, and compute that of its bias."""
         self.relu_passes[i]()
         if self.bias_sums:
             self.bias_sums[i]()
@@ -136,10 +137,10 @@ class DeterministicHead:
     """
     TD3's actor: a = tanh(f(s)) (Eq. 20).
 
-    :param layers: of the network
+    :param layers: layers of the network
     :param observations: (B, D), filled before each pass
     :param actions: (B, A), where the mean actions are written
-    :param bind: the passes
+    :param bind: binds the passes to their buffers
     :param gradients: see :class:`Mlp`
     """
 
@@ -158,13 +159,13 @@ class DeterministicHead:
             self.tanh_backward = bind(passes.tanh_backward, self.grad_actions, output, gradients[-1].bias)
 
     def act(self) -> th.Tensor:
-        """Write and return ``actions``."""
+        """Compute the mean actions, and return them in ``actions``."""
         self.network.forward()
         self.squash()
         return self.actions
 
     def backward(self) -> None:
-        """Compute the gradients from ``grad_actions`` (B, A), that of the loss at the actions."""
+        """Compute the gradients from ``grad_actions``, (B, A), the gradient of the loss at the actions."""
         self.tanh_backward()
         self.network.backward()
 
@@ -174,12 +175,12 @@ class TanhGaussianHead:
     SAC's actor: a = tanh(u), u = m(s) + σ(s)·ε (Eq. 21).
 
     log π = −½ε² − log σ − log(1 − a² + e) + const at fixed ε, so that ∂log π/∂u = 2a(1 − a²)/(1 − a² + e), ∂u/∂m = 1,
-    ∂u/∂log σ = σε, and log σ itself counts −1.
+    ∂u/∂log σ = σε, and the term −log σ adds −1. Here e is ``TANH_EPSILON``.
 
-    :param layers: of the network; the last two are m and log σ
+    :param layers: layers of the network; the last two are m and log σ
     :param observations: (B, D), filled before each pass
     :param actions: (B, A), where the samples are written
-    :param bind: the passes
+    :param bind: binds the passes to their buffers
     :param gradients: see :class:`Mlp`
     :param ent_coef: (1,), α, for the backward pass
     """
@@ -219,7 +220,7 @@ class TanhGaussianHead:
         ]
 
     def act(self) -> th.Tensor:
-        """Write and return ``actions``, a sample of the policy."""
+        """Sample actions from the policy, and return them in ``actions``."""
         self.network.forward()
         for product in self.heads:
             product()
@@ -233,7 +234,7 @@ class TanhGaussianHead:
         return self.log_probs
 
     def backward(self) -> None:
-        """Compute the gradients from ``grad_actions`` (B, A), that of the loss without the entropy at the actions."""
+        """Compute the gradients from ``grad_actions``, (B, A), that at the actions of the loss without entropy."""
         self.sample_backward()
         for product in self.head_products:
             product()

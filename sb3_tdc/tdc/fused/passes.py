@@ -1,8 +1,8 @@
 """
-The passes over memory between the matrix products, on preallocated tensors: in PyTorch, for where there is no Numba.
+The passes over memory between the matrix products, on preallocated tensors: in PyTorch, for CUDA or without Numba.
 
-Each function or class has a compiled twin of the same name and arguments in ``kernels.py``, where the arguments are
-described; a class is called with the arguments that come after the tensors.
+Each function or class has a compiled twin with the same name and arguments in ``kernels.py``, which describes the
+arguments. A class takes the tensors in its constructor, and the arguments after them when it is called.
 """
 
 import math
@@ -16,14 +16,14 @@ import torch as th
 from sb3_tdc.tdc.policies import LOG_SQRT_2_PI, LOG_STD_MAX, LOG_STD_MIN, TANH_EPSILON
 from sb3_tdc.tdc.quantiles import QuantileHuberGradient
 
-# Keep a gradient where an activation is above a threshold: with 0, the backward pass of a ReLU
+# Keeps a gradient where an activation is above a threshold; with the threshold 0, the backward pass of a ReLU
 threshold_backward = th.ops.aten.threshold_backward.grad_input
 _tanh_backward = th.ops.aten.tanh_backward.grad_input
 
 
 class Passes:
     """
-    Bind passes to preallocated tensors.
+    A function that binds passes to preallocated tensors.
 
     :param kernels: the module of compiled twins, or None
     """
@@ -33,11 +33,11 @@ class Passes:
 
     def __call__(self, function: Callable[..., Any], *tensors: th.Tensor | None) -> Callable[..., Any]:
         """
-        Bind a pass, compiled or as it is.
+        Bind a pass, or its compiled twin if there is one.
 
-        :param function: of this module
+        :param function: a function or class of this module
         :param tensors: its first arguments
-        :return: the function of the arguments after them
+        :return: a function of the remaining arguments
         """
         if self.kernels is None:
             return function(*tensors) if isinstance(function, type) else partial(function, *tensors)
@@ -82,7 +82,7 @@ class lcb_target:  # noqa: N801
         th.linalg.vector_norm(self.centred, dim=2, out=self.std)
         self.std.mul_(1 / math.sqrt(n_quantiles))  # Eq. 4
         th.addcmul(self.mean, self.lam, self.std, value=-1, out=self.score)
-        # Eq. 5. Of equal critics the first, as with argmin, which takes six times as long
+        # Eq. 5, the first of equal critics; argmin would give the same index in six times as long
         th.min(self.score, dim=0, out=(self.smallest, self.selected))
         th.add(self.row_numbers, self.selected, alpha=len(self.target), out=self.index)
         th.index_select(self.next_rows, 0, self.index, out=self.taken)  # Eq. 6

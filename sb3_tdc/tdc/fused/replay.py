@@ -1,4 +1,4 @@
-"""A replay buffer whose transitions lie in one place each."""
+"""A replay buffer that stores each transition in one contiguous row."""
 
 import sys
 from weakref import WeakKeyDictionary, ref
@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 
 _ARRAYS = ("observations", "actions", "next_observations", "rewards", "dones", "timeouts")
-# The methods of SB3 whose work this does: if a user has replaced them, it does not apply
+# Methods of SB3's buffer whose work PackedReplay does itself: it does not apply if a user has replaced one of them
 _METHODS = {
     name: getattr(ReplayBuffer, name)
     for name in ("sample", "_get_samples", "_normalize_obs", "_normalize_reward", "to_torch")
@@ -23,13 +23,13 @@ def row_widths(obs_dim: int, action_dim: int) -> list[int]:
 class PackedReplay:
     """
     The transitions of a ``ReplayBuffer`` as float32 rows [s | a | s' | r | d | t], so that a minibatch is one
-    ``index_select``, not a walk through six arrays.
+    ``index_select`` instead of a walk through six arrays.
 
-    The arrays of the buffer become views of the rows: what is added, changed or saved there is what is drawn here.
-    On CUDA the rows are copied to the device; those that the buffer has got since, when a minibatch is drawn. There,
-    what is changed in the buffer afterwards is not seen.
+    The arrays of the buffer become views of the rows, so transitions that are added to, changed in or saved with the
+    buffer are those drawn here. On CUDA the rows are copied to the device, and new ones follow when a minibatch is
+    drawn. Later changes to rows that have been copied are not seen there.
 
-    :param buffer: for which :meth:`applies`; it is not kept alive
+    :param buffer: a buffer for which :meth:`applies` is true; only a weak reference to it is kept
     """
 
     def __init__(self, buffer: ReplayBuffer):
@@ -42,11 +42,11 @@ class PackedReplay:
         self.host_rows = th.from_numpy(self.slots.reshape(-1, sum(widths)))
         self.rows = self.host_rows.to(buffer.device)
         self.pos = 0
-        self.steps: int | None = None  # when the rows were copied last
+        self.steps: int | None = None  # the count of steps when rows were last copied to the device
 
     @classmethod
     def of(cls, buffer: ReplayBuffer) -> "PackedReplay | None":
-        """Return the rows of a buffer, made once for all models that share it, or None where there can be none."""
+        """Return the rows of a buffer, shared by all models that use it, or None if it cannot be packed."""
         packed = _PACKED.get(buffer)
         if packed is None or not packed.holds(buffer):
             if not cls.applies(buffer):
@@ -57,8 +57,10 @@ class PackedReplay:
     @staticmethod
     def applies(buffer: ReplayBuffer) -> bool:
         """
-        Return whether ``sample`` of this buffer is SB3's plain one, of flat observations of real numbers in arrays that
-        nobody else writes to or keeps: not in a file, in shared memory, or parts of other arrays.
+        Return whether a buffer can be packed.
+
+        Its ``sample`` must be SB3's, and its observations flat. Observations and actions must be floats. The arrays
+        must be used by nothing else: not be in a file or in shared memory, nor be views of other arrays.
         """
         return (
             type(buffer) is ReplayBuffer
@@ -70,7 +72,7 @@ class PackedReplay:
         )
 
     def holds(self, buffer: ReplayBuffer) -> bool:
-        """Return whether this is the buffer, SB3 still samples it, and its arrays are still parts of the rows."""
+        """Return whether these are the rows of the buffer, its ``sample`` is SB3's, and its arrays are still views."""
         return (
             self.buffer_ref() is buffer
             and all(getattr(buffer, name).base is self.slots for name in _ARRAYS)
@@ -79,24 +81,24 @@ class PackedReplay:
 
     def draw(self, buffer: ReplayBuffer, n: int, steps: int) -> np.ndarray:
         """
-        Draw the rows of the minibatch that ``buffer.sample`` would draw, from the same random numbers.
+        Draw the indices of the transitions that ``buffer.sample`` would draw, from the same random numbers.
 
-        :param buffer: which these rows hold
-        :param n: how many
-        :param steps: count of steps of the environments, one for all of them
+        :param buffer: the buffer of these rows
+        :param n: number of transitions
+        :param steps: count of vectorised steps: one for a step of all environments
         :return: (n,), indices of ``rows``
         """
         if self.rows is not self.host_rows:
             self._copy_new_rows(buffer, steps)
         indices = np.random.randint(0, buffer.buffer_size if buffer.full else buffer.pos, size=n)
-        if buffer.n_envs > 1:  # of one, SB3 draws nothing
+        if buffer.n_envs > 1:  # with one environment, SB3's draw uses no random number
             indices = indices * buffer.n_envs + np.random.randint(0, high=buffer.n_envs, size=(n,))
         return indices
 
     def _copy_new_rows(self, buffer: ReplayBuffer, steps: int) -> None:
-        """Copy the rows to the device that have been written since the last copy."""
+        """Copy to the device the rows that have been written since the last copy."""
         size = buffer.buffer_size
-        if self.steps is None or steps - self.steps != (buffer.pos - self.pos) % size:  # or more than it holds
+        if self.steps is None or steps - self.steps != (buffer.pos - self.pos) % size:  # or a full round since
             self._copy_rows(0, buffer.size(), buffer.n_envs)
         elif buffer.pos < self.pos:
             self._copy_rows(self.pos, size, buffer.n_envs)
@@ -111,7 +113,7 @@ class PackedReplay:
 
 
 def _move(buffer: ReplayBuffer, name: str, part: np.ndarray) -> None:
-    """Let an array of the buffer be this part of the rows."""
+    """Move an array of the buffer into this part of the rows."""
     array = getattr(buffer, name)
     part = part if array.ndim == part.ndim else part[..., 0]
     filled = slice(0, buffer.size())
@@ -119,7 +121,7 @@ def _move(buffer: ReplayBuffer, name: str, part: np.ndarray) -> None:
     setattr(buffer, name, part)
 
 
-# Weak keys: a buffer's rows end with it
+# Weak keys: a buffer's rows are released with the buffer
 _PACKED: "WeakKeyDictionary[ReplayBuffer, PackedReplay]" = WeakKeyDictionary()
 
 
@@ -129,9 +131,9 @@ def _samples_plainly(buffer: ReplayBuffer) -> bool:
 
 
 def _is_private(buffer: ReplayBuffer, name: str) -> bool:
-    """Return whether an array of the buffer has memory of its own, and nothing else refers to it."""
+    """Return whether an array of the buffer owns its memory, and nothing else refers to the array."""
     array = vars(buffer)[name]
-    # An array that was unpickled may lie in bytes, which nobody can write to
+    # The memory of an unpickled array may be a bytes object, which nothing else can write to
     owns_memory = type(array) is np.ndarray and (array.base is None or isinstance(array.base, bytes))
     del array
     alone = {name: np.empty(0)}

@@ -1,13 +1,13 @@
-"""Numbers of Python that the device reads."""
+"""Python numbers in tensors, from which the device reads them."""
 
 import torch as th
 
 
 class Scalar:
     """
-    A tensor that holds one number of Python, written only when the number changes.
+    A tensor that holds one Python number, written only when the number changes.
 
-    :param tensor: of any shape
+    :param tensor: the tensor, of any shape; every element holds the number
     """
 
     def __init__(self, tensor: th.Tensor):
@@ -15,12 +15,12 @@ class Scalar:
         self.value: float | None = None
 
     def set(self, value: float) -> None:
-        """Let the tensor hold this number."""
+        """Fill the tensor with a number."""
         if value != self.value:
             self.tensor.fill_(value)
             self.value = value
 
     def copy_(self, values: th.Tensor) -> None:
-        """Let the tensor hold these numbers, until the next :meth:`set`."""
+        """Copy different numbers into the tensor, which holds them until the next :meth:`set`."""
         self.tensor.copy_(values)
         self.value = None

@@ -1,10 +1,10 @@
 """
-Whether anything that can influence an update is still what it was.
+Snapshots that detect a change of anything that can influence an update.
 
 Modules, parameters, their storage, the state and options of the optimizers, methods on classes and instances, and hooks
-are compared by identity, at every call of ``train``, after matrix products that have emptied the caches. So as few
-objects as possible are looked at: of a module its children, its parameters and how many attributes it has (one more
-where a method is replaced on the instance); of hooks, only how many have been registered in this process.
+are compared by identity, at every call of ``train``, after matrix products have evicted them from the caches. So as few
+objects as possible are read: of a module its children, its parameters and the number of its attributes (one more if a
+method is replaced on the instance); of hooks, only how many have been registered in this process.
 """
 
 import gc
@@ -19,7 +19,7 @@ from torch.utils.hooks import RemovableHandle
 
 from sb3_tdc.tdc.fused.applicability import REPLACED_METHODS, constants_of
 
-_options_of = operator.itemgetter(  # the learning rate may change
+_options_of = operator.itemgetter(  # all but the learning rate, which may change
     *("params", "betas", "eps", "weight_decay", "amsgrad", "maximize", "differentiable", "capturable")
 )
 _settings_of = operator.attrgetter(
@@ -31,14 +31,14 @@ _requires_grad = operator.attrgetter("requires_grad")
 
 def _equal(current: list[Any], copy: list[Any]) -> bool:
     try:
-        return current == copy  # by identity first; other tensors do not have a truth value
+        return current == copy  # by identity first; comparing two different tensors gives no truth value
     except (RuntimeError, ValueError, TypeError):
         return False
 
 
 class ModuleSnapshot:
     """
-    Modules as they are now.
+    The state of modules when the snapshot is taken.
 
     :param modules: all modules of some networks
     """
@@ -57,8 +57,8 @@ class ModuleSnapshot:
         self.storage = list(map(th.Tensor.data_ptr, self.parameters))
 
     def is_current(self) -> bool:
-        """Return whether the modules are the same; a hook registered anywhere counts as a change."""
-        # What dictionaries refer to is their values, in order: the fastest way to look at all of them
+        """Return whether the modules are unchanged; a hook registered anywhere counts as a change."""
+        # The referents of dictionaries include all their values, in order: the fastest way to compare them
         return (
             RemovableHandle.next_id == self.n_hooks
             and list(map(len, self.attributes)) == self.n_attributes
@@ -71,10 +71,10 @@ class ModuleSnapshot:
 
 class Snapshot:
     """
-    The networks and optimizers of a model as they are now, and the settings that an update reads from Python.
+    The state of a model's networks and optimizers, and the settings that an update reads from Python.
 
-    :param model: a :class:`~sb3_tdc.tdc.tdc.TDC` in whose way :func:`~sb3_tdc.tdc.fused.applicability.obstacles` found
-        nothing, with the state of its optimizers in place
+    :param model: a :class:`~sb3_tdc.tdc.tdc.TDC` for which :func:`~sb3_tdc.tdc.fused.applicability.obstacles` found
+        nothing, and whose optimizers already have their state
     """
 
     def __init__(self, model: Any):
@@ -97,7 +97,7 @@ class Snapshot:
         self.overridden = model.overridden_methods
 
     def is_current(self) -> bool:
-        """Return whether all of it is still the same; a hook registered anywhere counts as a change."""
+        """Return whether nothing has changed; a hook registered anywhere counts as a change."""
         return (
             _settings_of(self.model) == self.settings
             and self.modules.is_current()

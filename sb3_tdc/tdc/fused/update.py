@@ -28,11 +28,11 @@ def _call(function: Callable[[], Any]) -> Any:
 
 class FusedUpdate:
     """
-    One gradient step of TDC on preallocated buffers: the readable one is ``TDC.update``.
+    One gradient step of TDC on preallocated buffers; ``TDC.update`` is the readable version.
 
-    On CUDA each part is one graph, and the batch comes from a copy of the replay buffer on the device.
+    On CUDA each part is one graph, and the minibatch comes from a copy of the replay buffer on the device.
 
-    :param model: a ``TDC`` for which :func:`obstacles` found nothing; its parameters become views
+    :param model: a ``TDC`` for which :func:`obstacles` found nothing; the step counts of its optimizers become views
     :param batch_size: B
     """
 
@@ -55,9 +55,9 @@ class FusedUpdate:
 
         batch_size = self.batch_size
         widths = row_widths(obs_dim, action_dim)
-        self.rows = empty(batch_size, sum(widths))  # as a PackedReplay holds them
+        self.rows = empty(batch_size, sum(widths))  # in the format of a PackedReplay
         observations, actions, self.drawn_next_observations, rewards, dones, self.timeouts = self.rows.split(widths, 1)
-        # [s | a] and [s' | ã]; the actor reads from the first columns, its actions go to the last
+        # [s | a] and [s' | ã]; an actor reads the first columns and writes its actions to the last
         self.inputs, self.next_inputs = self.rows[:, : obs_dim + action_dim], empty(batch_size, obs_dim + action_dim)
         next_observations, self.next_actions = self.next_inputs.split([obs_dim, action_dim], 1)
         self.minibatch = ReplayBufferSamples(observations, actions, next_observations, dones, rewards)
@@ -69,7 +69,7 @@ class FusedUpdate:
         batch, bind = self.minibatch, self.bind
         online, target, gradient = self._networks(self.critic_adam)
         self.critic_target = Mlp(target, self.next_inputs)
-        # What was predicted for s' is not needed any more when the gradients are written
+        # When the gradients are written, the target critics' outputs are no longer needed: their buffers are reused
         self.critic = Mlp(online, self.inputs, gradient, grad_outputs=self.critic_target.outputs)
 
         next_quantiles, current = self.critic_target.outputs[-1], self.critic.outputs[-1]
@@ -113,24 +113,24 @@ class FusedUpdate:
 
     @staticmethod
     def _networks(adam: AdamStep) -> list[list[Layer]]:
-        """Return the layers of the online network, of the target, and of the gradient."""
+        """Return the layers of the online network, of its target, and of its gradients."""
         return [make_layers(tensors) for tensors in (adam.values, adam.targets, adam.gradients)]
 
     def fits(self, batch_size: int) -> bool:
-        """Return whether the buffers are of this size, and all that an update relies on is as it was."""
+        """Return whether the buffers have this batch size, and everything that an update relies on is unchanged."""
         return batch_size == self.batch_size and self.snapshot.is_current()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> None:
-        """Return None: a copy of the model binds an update to its own networks."""
+        """Return None: a copy of the model binds a new update to its own networks."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()  # and so does one that was pickled
+        return type(None), ()  # an unpickled model also binds a new update
 
     def step(self, lam: float) -> None:
         """Do what ``TDC.update`` does, on a minibatch of the model's replay buffer."""
         model = self.model
         replay_data = self.sample()
-        if len(replay_data.rewards) != self.batch_size:  # a custom replay buffer may return fewer than it was asked for
+        if len(replay_data.rewards) != self.batch_size:  # a custom replay buffer may return fewer transitions
             model.update(replay_data, lam)
             return
         self.update_critics(replay_data, lam)
@@ -141,7 +141,7 @@ class FusedUpdate:
             model.diagnose_units(replay_data)
 
     def sample(self) -> ReplayBufferSamples:
-        """Return a minibatch of the model's replay buffer; of a packed one, the next overwrites it."""
+        """Return a minibatch of the model's replay buffer; from a packed one, the next minibatch overwrites it."""
         model, packed = self.model, self._find_packed_replay()
         if packed is None:
             return model.replay_buffer.sample(self.batch_size, env=model._vec_normalize_env)
@@ -149,7 +149,7 @@ class FusedUpdate:
         return self.minibatch
 
     def _find_packed_replay(self) -> PackedReplay | None:
-        """Return the model's replay buffer as rows, where that is possible."""
+        """Return the packed rows of the model's replay buffer, or None where they cannot be used."""
         buffer = self.model.replay_buffer
         if self.model._vec_normalize_env is not None:
             return None
@@ -165,7 +165,7 @@ class FusedUpdate:
         return self.bind(passes.gather, packed.rows, self.rows, *next_observations, batch.dones, self.timeouts)
 
     def acts(self) -> bool:
-        """Return whether :meth:`act` is what the policy does."""
+        """Return whether :meth:`act` still computes what the policy does."""
         return self.model.policy is self.policy and self.actor_snapshot.is_current()
 
     def act(self, observations: np.ndarray) -> np.ndarray:
