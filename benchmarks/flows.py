@@ -12,7 +12,7 @@ from typing import Any
 
 import torch as th
 
-from benchmarks.speed import Load, _optional, hardware, repeat, time_calls
+from benchmarks.speed import Load, optional, hardware, repeat, time_calls
 
 ENV, BATCH, BLOCKS, WIDTHS = "HalfCheetah-v4", 256, 2, (64, 64)
 
@@ -42,7 +42,7 @@ def couplings(features_dim: int = 17, action_dim: int = 6) -> dict[str, Callable
         (z.square().sum() + log_det.sum()).backward()
 
     found = {"couplings of sb3_tdc": repeat(run_ours)}
-    if zuko := _optional("zuko"):
+    if zuko := optional("zuko"):
         even = th.arange(action_dim) % 2 == 0
         shifts = th.nn.ModuleList(
             zuko.flows.coupling.GeneralCouplingTransform(

@@ -65,15 +65,15 @@ def make_models(env_id: str) -> dict[str, Any]:
         "SB3 SAC": SAC(**settings(), device="cpu"),
         "naive transcription": NaiveTDC(**{**settings(), "policy": NaivePolicy}, device="cpu", action_noise=noise),
     }
-    if contrib := _optional("sb3_contrib"):
+    if contrib := optional("sb3_contrib"):
         models["contrib TQC, 64 quantiles"] = contrib.TQC(**settings(n_quantiles=64), device="cpu")
-    if sbx := _optional("sbx"):
+    if sbx := optional("sbx"):
         models["SBX TD3"] = sbx.TD3(**settings(), action_noise=noise, policy_delay=2)
         models["SBX TQC, 64 quantiles"] = sbx.TQC(**settings(n_quantiles=64))
     return models
 
 
-def _optional(name: str) -> Any:
+def optional(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tdc.cli.plot import style_axes
+from sb3_tdc.common.plots import style_axes
 
 _TDC = "TDC"
 _OTHER_PAIRS = ("SB3 TD3 / TDC, readable update", "SB3 SAC / TDC, stochastic head")
