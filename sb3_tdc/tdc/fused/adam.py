@@ -55,8 +55,8 @@ class AdamStep:
 
     def show_gradients(self) -> None:
         """Make each parameter's ``grad`` its preallocated gradient, where it is None or another tensor."""
-        if self.parameters[0].grad is not self.gradients[0]:
-            for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
+        for parameter, gradient in zip(self.parameters, self.gradients, strict=True):
+            if parameter.grad is not gradient:
                 parameter.grad = gradient
 
     def update_targets(self, tau: float) -> None:
