@@ -7,10 +7,7 @@ from pathlib import Path
 from tests.helpers.paths import ROOT
 
 SMALL = {"learning_starts": 20, "batch_size": 8, "buffer_size": 500}
-
-
 SMALL_TDC = {**SMALL, "policy_kwargs": {"net_arch": [8], "n_quantiles": 4}}
-
 
 # The matrix command with custom suites: small networks on Pendulum, and one run that fails
 CODE = f"""

@@ -107,9 +107,13 @@ def lent_by_mmap(numbers):
     return np.frombuffer(memory)
 
 
+@functools.cache  # compiling takes longer than everything else in a test
+def _compiled_copy():
+    return pytest.importorskip("numba").njit(lambda array: array + 0.0)
+
+
 def lent_by_numba(numbers):
-    numba = pytest.importorskip("numba")
-    return numba.njit(lambda array: array + 0.0)(np.array(numbers))
+    return _compiled_copy()(np.array(numbers))
 
 
 LENT = [lent_by_ctypes, lent_by_mmap, lent_by_numba, lambda numbers: np.asarray(Lends(numbers))]
