@@ -12,7 +12,7 @@ from typing import Any
 
 import torch as th
 
-from benchmarks.speed import Load, optional, hardware, repeat, time_calls
+from benchmarks.speed import Load, hardware, optional, repeat, time_calls
 
 ENV, BATCH, BLOCKS, WIDTHS = "HalfCheetah-v4", 256, 2, (64, 64)
 
