@@ -315,6 +315,7 @@ def test_a_signal_does_not_wait_for_the_end_of_an_endless_episode(tmp_path, caps
     assert "To continue from step 0:" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_several_kills(tmp_path):
     """Fewer kills than ``python -m tests.tools.kill`` makes by default."""
     assert kill.main(["--kills", "3", "--steps", "1500", "--longest", "0.4", "--folder", str(tmp_path)]) == 0
