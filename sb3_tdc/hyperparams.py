@@ -147,6 +147,21 @@ def _split_version(env_id: str) -> tuple[str, int]:
     return (base, int(version)) if base and version.isdecimal() else (env_id, -1)
 
 
+def merge(entry: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
+    """
+    Return an entry with values replaced.
+
+    :param overrides: the values. If they set the noise, by ``action_noise`` or by ``noise_type`` and ``noise_std``, the
+        entry's noise by the other keys is dropped
+    """
+    dropped: tuple[str, ...] = ()
+    if "action_noise" in overrides:
+        dropped = _OF_NOISE
+    elif any(key in overrides for key in _OF_NOISE):
+        dropped = ("action_noise",)
+    return {**{key: value for key, value in entry.items() if key not in dropped}, **overrides}
+
+
 def parse(
     entry: dict[str, Any],
     algorithm: type[BaseAlgorithm],
@@ -165,16 +180,16 @@ def parse(
     :raises ValueError: naming the key, its value, the allowed values, and the nearest known key
     """
     overrides = overrides or {}
-    entry = _without_other_noise(entry, overrides)
+    raw = merge(entry, overrides)
     hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _NO_HYPERPARAMETERS}
     hints.update(_RUN_KEYS)
-    replaced = {key: value for key, value in entry.items() if key not in overrides}
-    for mapping, place_of in ((replaced, where), (overrides, where_overrides)):
+    kept = {key: value for key, value in raw.items() if key not in overrides}
+    for mapping, place_of in ((kept, where), (overrides, where_overrides)):
         for key in (key for key in mapping if key in _FLAGS):
             raise ValueError(f"{place_of}: {key} is not a hyperparameter; use {_FLAGS[key]}")
     limits = {**getattr(algorithm, "limits", OFF_POLICY_LIMITS), **_RUN_LIMITS}
     values = {
-        **convert_mapping(replaced, hints, where, limits),
+        **convert_mapping(kept, hints, where, limits),
         **convert_mapping(overrides, hints, where_overrides, limits),
     }
 
@@ -198,7 +213,7 @@ def parse(
     for key in ("env_wrapper", "vec_env_wrapper"):
         run[key] = _factories(run.get(key), f"{place(key)}: {key}")
     return Hyperparams(
-        raw={**entry, **overrides},
+        raw=raw,
         model=values,
         normalize=normalize or None,
         callbacks=_factories(run.pop("callback", None), f"{place('callback')}: callback"),
@@ -252,15 +267,6 @@ def _numbers_in(value: Any) -> Iterator[float]:
             yield from _numbers_in(part)
     elif isinstance(value, (int, float)) and not isinstance(value, bool):
         yield value
-
-
-def _without_other_noise(entry: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
-    """Drop the entry's noise if the overrides set the noise by the other keys (``action_noise``, or ``_OF_NOISE``)."""
-    if "action_noise" in overrides:
-        return {key: value for key, value in entry.items() if key not in _OF_NOISE}
-    if any(key in overrides for key in _OF_NOISE):
-        return {key: value for key, value in entry.items() if key != "action_noise"}
-    return entry
 
 
 def _check_noise(values: dict[str, Any], where: str) -> None:

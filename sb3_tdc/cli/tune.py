@@ -17,7 +17,7 @@ from sb3_tdc.envs.registry import import_packages, split_env_id
 from sb3_tdc.experiments.jobs import Job, cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs
-from sb3_tdc.experiments.trials import make_trials, read_returns, run_trials
+from sb3_tdc.experiments.trials import make_trials, read_shared_evaluations, run_trials
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import folder_name
 from sb3_tdc.runs.settings import plain_arguments
@@ -193,6 +193,6 @@ def _run(args: argparse.Namespace, candidates: Sequence[Sequence[Job]]) -> int:
     if not is_complete:
         print(f"Stopped. To continue:\n  {command('tune', '--resume', args.folder)}", file=sys.stderr)
         return 130
-    if any(read_returns(jobs).size for jobs in candidates):
+    if any(len(read_shared_evaluations(jobs)[0]) for jobs in candidates):
         write_results(args.folder, candidates, args.searched)
     return int(bool(failed))

@@ -18,8 +18,8 @@ from typing import Any
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.files import lock
-from sb3_tdc.experiments.results import Run, check_same_run
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.experiments.results import Run, check_same_run, shorten_warm_up
+from sb3_tdc.hyperparams import hyperparams_file, merge, read_entry
 from sb3_tdc.resume import DEFAULT_FREQ
 from sb3_tdc.resume.store import stored_steps
 from sb3_tdc.runs.folder import RunFolder, folder_name
@@ -56,9 +56,9 @@ class Job:
     def config(self) -> dict[str, Any]:
         """All hyperparameters; unless set, the warm-up is that of ``hyperparams/``, but at most a tenth of the run."""
         entry, _ = read_entry(hyperparams_file(self.algo), self.env_id)
-        config = {**entry, **self.settings, "n_timesteps": self.n_timesteps}
+        config = {**merge(entry, self.settings), "n_timesteps": self.n_timesteps}
         if "learning_starts" in entry and "learning_starts" not in self.settings:
-            config["learning_starts"] = min(entry["learning_starts"], self.n_timesteps // 10)
+            config["learning_starts"] = shorten_warm_up(entry["learning_starts"], self.n_timesteps)
         return config
 
     @property

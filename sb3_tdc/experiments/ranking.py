@@ -9,33 +9,33 @@ import pandas as pd
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.commands import command
 from sb3_tdc.experiments.figures import COLORS, draw_sweep
-from sb3_tdc.experiments.jobs import Job, eval_freq
-from sb3_tdc.experiments.trials import read_returns
-from sb3_tdc.hyperparams import hyperparams_file, read_entry
+from sb3_tdc.experiments.jobs import Job
+from sb3_tdc.experiments.trials import read_shared_evaluations
+from sb3_tdc.hyperparams import hyperparams_file, merge, read_entry
 
 
 def rank(candidates: Sequence[Sequence[Job]], searched: Sequence[str]) -> pd.DataFrame:
     """
     Rank candidates, best first, by the mean over seeds of the mean of all evaluations.
 
-    Only the evaluations that all seeds of a candidate have are counted. A candidate with fewer steps than another
-    (stopped early, or failed) comes after it.
+    Only the evaluations that all seeds of a candidate have are counted. Unfinished candidates (stopped early, or
+    failed) come after the finished ones, in the order of their steps.
 
     :param candidates: for each candidate, the jobs of its seeds
     :param searched: names of the searched hyperparameters, which are the first columns
     """
     rows = []
     for number, jobs in enumerate(candidates):
-        scores = read_returns(jobs)
-        steps = scores.shape[1] * eval_freq(jobs[0].n_timesteps)
+        timesteps, scores = read_shared_evaluations(jobs)
+        steps = timesteps[-1] if len(timesteps) else 0
         per_seed = scores.mean(axis=1) if steps else np.full(len(jobs), np.nan)
+        trained = np.inf if all(job.is_finished for job in jobs) else steps
         spread = per_seed.std(ddof=1) if len(jobs) > 1 else np.nan
         settings = {key: jobs[0].settings[key] for key in searched}
-        rows.append(
-            {**settings, "mean": per_seed.mean(), "std": spread, "seeds": len(jobs), "steps": steps, "number": number}
-        )
-    table = pd.DataFrame(rows).sort_values(["steps", "mean"], ascending=False, kind="stable")
-    return table.set_index("number")
+        measured = {"mean": per_seed.mean(), "std": spread, "seeds": len(jobs), "steps": steps}
+        rows.append({**settings, **measured, "trained": trained, "number": number})
+    table = pd.DataFrame(rows).sort_values(["trained", "mean"], ascending=False, kind="stable")
+    return table.set_index("number").drop(columns="trained")
 
 
 def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
@@ -44,14 +44,16 @@ def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
 
     If other hyperparameters are searched too, each value is represented by its best candidate.
 
+    :param candidates: candidates with evaluations, whose values of the hyperparameter are numbers
     :param path: path of the figures, without a suffix
     """
     from matplotlib.figure import Figure
 
-    shortest = min(read_returns(jobs).shape[1] for jobs in candidates)
+    evaluations = [read_shared_evaluations(jobs) for jobs in candidates]
+    last_step = min(timesteps[-1] for timesteps, _ in evaluations)
     best: dict[float, np.ndarray] = {}
-    for jobs in candidates:
-        value, scores = jobs[0].settings[key], read_returns(jobs)[:, :shortest].mean(axis=1)
+    for jobs, (timesteps, returns) in zip(candidates, evaluations, strict=True):
+        value, scores = jobs[0].settings[key], returns[:, timesteps <= last_step].mean(axis=1)
         if value not in best or scores.mean() > best[value].mean():
             best[value] = scores
     job = candidates[0][0]
@@ -61,7 +63,7 @@ def draw(candidates: Sequence[Sequence[Job]], key: str, path: Path) -> None:
     draw_sweep(
         axes, sorted(best), [best[value] for value in sorted(best)], job.env_id, name, COLORS.get(job.algo.upper())
     )
-    axes.set_ylabel(f"mean return until step {shortest * eval_freq(job.n_timesteps):,}")
+    axes.set_ylabel(f"mean return until step {last_step:,}")
     for suffix in (".png", ".pdf"):
         figure.savefig(f"{path}{suffix}")
 
@@ -72,12 +74,13 @@ def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: S
     table.to_csv(folder / "ranking.csv", index=False)
     print(table.to_string(index=False, float_format=lambda x: f"{x:g}", na_rep="–"))
     for key in searched:
-        values = {jobs[0].settings[key] for jobs in candidates if isinstance(jobs[0].settings[key], (int, float))}
-        if len(values) > 1 and (table["steps"] > 0).all():
-            draw(candidates, key, folder / key)
+        evaluated = [jobs for jobs in candidates if len(read_shared_evaluations(jobs)[0])]
+        numbers = [jobs for jobs in evaluated if type(jobs[0].settings[key]) in (int, float)]
+        if len({jobs[0].settings[key] for jobs in numbers}) > 1:
+            draw(numbers, key, folder / key)
     best = candidates[int(table.index[0])][0]
     entry, _ = read_entry(hyperparams_file(best.algo), best.env_id)
-    content = {best.env_id: {**entry, **best.settings}}  # with the number of steps of a whole training, not of a trial
+    content = {best.env_id: merge(entry, best.settings)}  # with the number of steps of a whole training, not of a trial
     (folder / "best.yml").write_text(plain_yaml.dump(content, sort_keys=False))
     print(f"Ranking, figures and the best hyperparameters are in {folder}")
     packages = ["--gym-packages", *best.packages] if best.packages else []

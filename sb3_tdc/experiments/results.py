@@ -86,7 +86,7 @@ class Run:
         """Return the value of a setting, or its default if none is given."""
         return self.settings.get(key, default_settings(self.algo).get(key))
 
-    @property
+    @cached_property
     def n_timesteps(self) -> int:
         """Environment steps that the run was to take."""
         return self.folder.n_timesteps
@@ -241,6 +241,11 @@ def default_settings(algo: str) -> dict[str, Any]:
     """Return the defaults of the algorithm's constructor and of ``sb3-tdc train``."""
     parameters = constructor_parameters(KNOWN_ALGORITHMS[algo]).values() if algo in KNOWN_ALGORITHMS else ()
     return {**{p.name: p.default for p in parameters if p.default is not p.empty}, **_SETTINGS}
+
+
+def shorten_warm_up(learning_starts: int, n_timesteps: int) -> int:
+    """Return the warm-up of a run of the matrix: that of ``hyperparams/``, but at most a tenth of the run."""
+    return min(learning_starts, n_timesteps // 10)
 
 
 def canonical(value: Any) -> str:

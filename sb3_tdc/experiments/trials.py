@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sb3_tdc.common.words import count
-from sb3_tdc.experiments.jobs import Job, eval_freq, stop
+from sb3_tdc.experiments.jobs import Job, stop
 from sb3_tdc.experiments.results import Run
 
 _POLL_SECONDS = 1.0  # each poll reads the files of the runs, which takes time from training
@@ -38,7 +38,7 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
             deadline = time.monotonic() + _LONGEST_STEP_SECONDS
             while True:
                 has_ended = all(process.poll() is not None for process in self.processes)
-                returns = read_returns(self.jobs)
+                timesteps, returns = read_shared_evaluations(self.jobs)
                 if has_ended or returns.shape[1] > self.n_reported or time.monotonic() > deadline:
                     break
                 time.sleep(_POLL_SECONDS)
@@ -47,7 +47,7 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
                 raise RuntimeError("; ".join(f"{job}: see {job.log}: {' | '.join(job.last_lines())}" for job in failed))
             self.n_reported = n = min(self.n_reported + 1, returns.shape[1])
             return {
-                "steps": n * eval_freq(self.jobs[0].n_timesteps),
+                "steps": int(timesteps[n - 1]) if n else 0,
                 "mean_return": float(returns[:, :n].mean()) if n else float("nan"),
                 "last_return": float(returns[:, n - 1].mean()) if n else float("nan"),
                 "done": has_ended and n == returns.shape[1],
@@ -59,8 +59,12 @@ def make_trainable(tune: Any, trials: Mapping[str, Sequence[Job]]) -> Any:
     return Trial
 
 
-def read_returns(jobs: Sequence[Job]) -> np.ndarray:
-    """Return the mean of every evaluation that all seeds have, (seeds, evaluations)."""
+def read_shared_evaluations(jobs: Sequence[Job]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Read the evaluations that all seeds have.
+
+    :return: timesteps, (evaluations,), and mean returns, (seeds, evaluations)
+    """
     found = []
     for job in jobs:
         folder = job.run_folder
@@ -68,9 +72,11 @@ def read_returns(jobs: Sequence[Job]) -> np.ndarray:
             evaluations = None if folder is None else Run.open(folder.path).evaluations
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):  # it is being written
             evaluations = None
-        found.append(np.empty(0) if evaluations is None else evaluations.returns.mean(axis=1))
-    shortest = min(map(len, found))
-    return np.array([returns[:shortest] for returns in found])
+        if evaluations is None:
+            return np.empty(0, int), np.empty((len(jobs), 0))
+        found.append(evaluations)
+    shortest = min(len(each.timesteps) for each in found)
+    return found[0].timesteps[:shortest], np.array([each.returns[:shortest].mean(axis=1) for each in found])
 
 
 def run_trials(args: argparse.Namespace, trials: Mapping[str, Sequence[Job]]) -> tuple[bool, list[str]]:

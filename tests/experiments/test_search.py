@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
+from sb3_tdc import TDC
 from sb3_tdc.cli import train, tune
 from sb3_tdc.experiments import ranking, search, trials
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.experiments.search_space import LAMBDAS, Distribution, make_candidates, parse_space
+from sb3_tdc.hyperparams import hyperparams_file, parse, read_entry
 from sb3_tdc.runs.folder import RunFolder
 from tests.helpers.matrices import is_running, runs_of
 from tests.helpers.searches import arguments
@@ -84,6 +86,43 @@ def test_ranking_by_hand(tmp_path):
     best = yaml.safe_load((tmp_path / "best.yml").read_text())["Hopper-v4"]
     assert (best["lam"], best["n_timesteps"]) == (0.2, 1_500_000)
     assert (tmp_path / "lam.png").stat().st_size > 5_000
+
+
+def test_finished_candidates_are_ranked_by_their_return_whenever_they_were_evaluated(tmp_path):
+    """With several environments, evaluations come a little earlier, and there may be one more."""
+    candidates = [make_candidate(tmp_path, lam, [[each] * 3]) for lam, each in ((0.1, 5), (0.2, 9), (0.3, 1))]
+    more = np.array([[1.0, 1.0]] * 4)
+    np.savez(candidates[2][0].run_folder.path / "evaluations.npz", timesteps=[48, 96, 144, 150], results=more)
+    for jobs in candidates:
+        jobs[0].run_folder.mark_finished(150)
+    table = ranking.rank(candidates, ["lam"])
+    assert table["lam"].tolist() == [0.2, 0.1, 0.3]
+    assert table["steps"].tolist() == [150, 150, 150]
+    assert trials.read_shared_evaluations(candidates[2])[0].tolist() == [48, 96, 144, 150]
+
+
+def test_a_search_over_numbers_and_texts(tmp_path):
+    candidates = [make_candidate(tmp_path, lam, [[2, each]]) for lam, each in ((0.1, 4), (0.2, 6), ("lin_0.3", 8))]
+    candidates.append([Job("tdc", "Hopper-v4", 1, 1500, tmp_path / "failed", {"lam": 0.4})])  # never evaluated
+    ranking.write_results(tmp_path, candidates, ["lam"])
+    assert yaml.safe_load((tmp_path / "best.yml").read_text())["Hopper-v4"]["lam"] == "lin_0.3"
+    assert (tmp_path / "lam.png").stat().st_size > 5_000
+
+
+def test_a_search_over_the_noise_replaces_that_of_the_file(tmp_path):
+    job = Job("tdc", "Hopper-v4", 1, 1500, tmp_path, {"action_noise": 0.2})
+    assert "noise_type" in Job("tdc", "Hopper-v4", 1, 1500, tmp_path).config
+    assert not {"noise_type", "noise_std"} & set(job.config)
+    run = RunFolder.create(job.logs, "tdc", "Hopper-v4")
+    entry, _ = read_entry(hyperparams_file("tdc"), "Hopper-v4")
+    # As train writes it
+    given = parse(entry, TDC, "file", {"action_noise": 0.2, "learning_starts": 150, "n_timesteps": 1500}, "flags")
+    run.write_config(given.raw, {"algo": "tdc", "env": "Hopper-v4", "seed": 1, "eval_freq": 50})
+    np.savez(run.path / "evaluations.npz", timesteps=[50], results=[[1.0, 2.0]])
+    ranking.write_results(tmp_path, [[job]], ["action_noise"])
+    best, _ = read_entry(tmp_path / "best.yml", "Hopper-v4")
+    assert parse(best, TDC, "best.yml").model["action_noise"] == 0.2
+    assert best["n_timesteps"] == entry["n_timesteps"]
 
 
 def test_trials(tmp_path):
