@@ -76,7 +76,8 @@ def _describe(args: argparse.Namespace, plan: Plan) -> None:
     if plan.jobs and args.scale < 1:
         print(
             f"At {args.scale:g} of the paper's steps, so are the evaluations (every thirtieth of a run, at most 20,000 "
-            "steps); random steps at the start: as in the paper, but at most a tenth of a run."
+            "steps); random steps at the start: as in the paper, but at most a tenth of a run; where a suite varies "
+            "them, in the same proportion."
         )
 
 

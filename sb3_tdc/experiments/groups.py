@@ -1,19 +1,27 @@
 """Runs → groups of runs that may be averaged; which groups may be compared, and how they are named."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from sb3_tdc.experiments.results import Run, canonical, default_settings, flatten, same_settings
+from sb3_tdc.experiments.results import (
+    Run,
+    canonical,
+    default_settings,
+    flatten,
+    same_settings,
+    shorten_warm_up,
+)
 from sb3_tdc.experiments.statistics import final_return
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
+EVALUATION = ("eval_freq", "eval_episodes")
 # The length of a run, its evaluations and its simulator: not hyperparameters of the algorithm
-_NOT_HYPERPARAMETERS = {"n_timesteps", "eval_freq", "eval_episodes", "mujoco"}
+_NOT_HYPERPARAMETERS = {"n_timesteps", *EVALUATION, "mujoco"}
 
 
 @dataclass(frozen=True, order=True)
@@ -52,12 +60,18 @@ class Group:
     """
     Runs that differ only in their seed.
 
-    :param label: the algorithm, and the settings that distinguish it from groups of the same algorithm and conditions
     :param runs: at least one run, in the order of their seeds
+    :param distinguishing: the settings that differ from ``hyperparams/`` and vary among groups of the same algorithm
+        under the same conditions
     """
 
-    label: str
     runs: tuple[Run, ...]
+    distinguishing: Mapping[str, Any] = field(default_factory=dict, compare=False)
+
+    @property
+    def label(self) -> str:
+        """The algorithm, and the settings that distinguish the group under its conditions."""
+        return _named(self.algo, self.distinguishing)
 
     @property
     def algo(self) -> str:
@@ -108,9 +122,9 @@ class Group:
 
     @property
     def name(self) -> str:
-        """The algorithm, and its hyperparameters that differ from ``hyperparams/``: for tables of many tasks."""
+        """The label with all hyperparameters that differ from ``hyperparams/``: for tables of many tasks."""
         differing = hyperparameters_not_shipped(self.runs[0]) if _shipped(self.algo, self.env_id) else {}
-        return f"{self.algo.upper()}, {describe(differing)}" if differing else self.label
+        return _named(self.algo, {**differing, **self.distinguishing})
 
     @property
     def commits(self) -> tuple[str, ...]:
@@ -120,6 +134,12 @@ class Group:
     @property
     def is_as_shipped(self) -> bool:
         return is_as_shipped(self.runs[0])
+
+    @property
+    def has_whole_warm_up(self) -> bool:
+        """Return whether the warm-up is that of ``hyperparams/``, which the matrix shortens in a short run."""
+        warm_up = _shipped(self.algo, self.env_id).get("learning_starts")
+        return warm_up is None or self.setting("learning_starts") == warm_up
 
     def setting(self, key: str) -> Any:
         return self.runs[0].setting(key)
@@ -138,7 +158,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
         if run.seed not in seeds or _rank(run) >= _rank(seeds[run.seed]):
             seeds[run.seed] = run
     members = [tuple(seeds[seed] for seed in sorted(seeds)) for seeds in found.values()]
-    groups = [Group(_label(group[0], [other[0] for other in members]), group) for group in members]
+    groups = [Group(group, _distinguishing(group[0], [other[0] for other in members])) for group in members]
     place = {algo: i for i, algo in enumerate(KNOWN_ALGORITHMS)}
     return sorted(groups, key=lambda g: (g.conditions, place.get(g.algo, len(place)), g.label))
 
@@ -164,31 +184,39 @@ def vary(groups: Iterable[Group], key: str) -> list[list[Group]]:
     """
     found: dict[str, list[Group]] = {}
     for group in groups:
-        found.setdefault(_identity(group.runs[0], without=key), []).append(group)
+        found.setdefault(_identity(group.runs[0], without={key}), []).append(group)
     return [sorted(some, key=lambda g: _sortable(g.setting(key))) for some in found.values() if len(some) > 1]
 
 
-def have_same_settings(one: Group, other: Group, but: str | None = None) -> bool:
+def have_same_settings(one: Group, other: Group, but: Collection[str] = ()) -> bool:
     """
     Return whether two groups have the same settings, even if their algorithms differ.
 
-    :param but: a setting that may differ
+    :param but: settings that may differ
     """
     return _identity(one.runs[0], but, algo=other.algo) == _identity(other.runs[0], but)
 
 
-def as_shipped(groups: Sequence[Group]) -> list[Group]:
+def as_shipped(groups: Iterable[Group]) -> list[Group]:
     """
     Return one group for each algorithm, with the hyperparameters of ``hyperparams/``.
 
-    :param groups: groups under the same conditions; if several of an algorithm differ in their evaluations or their
-        warm-up, the one with the most finished seeds is taken
+    :param groups: groups under the same conditions. If several of an algorithm differ in their warm-up, the choice is
+        the same for all algorithms where possible; if they differ in their evaluations, the one with the most finished
+        seeds is taken
     """
-    found: dict[str, Group] = {}
-    for group in groups:
-        if group.is_as_shipped and (group.algo not in found or len(group.finished) > len(found[group.algo].finished)):
-            found[group.algo] = group
-    return list(found.values())
+    shipped = [group for group in groups if group.is_as_shipped]
+    with_whole, with_short = (
+        {group.algo for group in shipped if group.finished and group.has_whole_warm_up == whole}
+        for whole in (True, False)
+    )
+    prefers_whole = len(with_whole) >= len(with_short)
+
+    def rank(group: Group) -> tuple[bool, bool, int]:
+        return bool(group.finished), group.has_whole_warm_up == prefers_whole, len(group.finished)
+
+    algos = dict.fromkeys(group.algo for group in shipped)
+    return [max((group for group in shipped if group.algo == algo), key=rank) for algo in algos]
 
 
 def is_as_shipped(run: Run, but: Iterable[str] = ()) -> bool:
@@ -208,7 +236,7 @@ def hyperparameters_not_shipped(run: Run) -> dict[str, Any]:
     """
     differing = {key: value for key, value in differences(run).items() if key not in _NOT_HYPERPARAMETERS}
     warm_up = _shipped(run.algo, run.env_id).get("learning_starts")
-    if warm_up is not None and run.setting("learning_starts") == min(warm_up, run.n_timesteps // 10):
+    if warm_up is not None and run.setting("learning_starts") == shorten_warm_up(warm_up, run.n_timesteps):
         differing.pop("learning_starts", None)
     return differing
 
@@ -278,31 +306,32 @@ def _conditions(run: Run) -> Conditions:
     return Conditions(run.env_id, run.n_timesteps, run.setting("mujoco") or "")
 
 
-def _label(run: Run, representatives: Sequence[Run]) -> str:
+def _named(algo: str, settings: Mapping[str, Any]) -> str:
+    return f"{algo.upper()}, {describe(settings)}" if settings else algo.upper()
+
+
+def _distinguishing(run: Run, representatives: Sequence[Run]) -> dict[str, Any]:
     """
-    Return the algorithm's name, and the settings that distinguish the run and differ from ``hyperparams/``.
+    Return the settings of a run that differ from ``hyperparams/`` and vary among its likes.
 
-    A setting distinguishes if it varies among the representatives with the same algorithm and conditions.
-
-    :param representatives: one run of every group
+    :param representatives: one run of every group; its likes have its algorithm and conditions
     """
     likes = [o for o in representatives if o.algo == run.algo and _conditions(o) == _conditions(run)]
     keys = {key for other in likes for key in other.settings}
     telling = {key for key in keys if len({canonical(other.setting(key)) for other in likes}) > 1}
-    shown = {key: value for key, value in differences(run).items() if key in telling}
-    return f"{run.algo.upper()}, {describe(shown)}" if shown else run.algo.upper()
+    return {key: value for key, value in differences(run).items() if key in telling}
 
 
-def _identity(run: Run, without: str | None = None, algo: str | None = None) -> str:
+def _identity(run: Run, without: Collection[str] = (), algo: str | None = None) -> str:
     """
     Return a text that is equal for runs that differ only in their seed; an explicit default equals an omitted setting.
 
-    :param without: a setting to leave out
+    :param without: settings to leave out
     :param algo: the algorithm to assume instead of the run's
     """
     algo = algo or run.algo
     settings = {**default_settings(algo), **run.settings}
-    return canonical([algo, run.env_id, {key: value for key, value in settings.items() if key != without}])
+    return canonical([algo, run.env_id, {key: value for key, value in settings.items() if key not in without}])
 
 
 def _sortable(value: Any) -> tuple[bool, Any]:

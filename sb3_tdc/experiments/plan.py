@@ -10,7 +10,7 @@ from sb3_tdc.common.checks import suggest
 from sb3_tdc.envs.registry import require_env, simulator_of
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.experiments.rates import MEASURED_STEPS, measure_rate
-from sb3_tdc.experiments.results import default_settings, same_settings
+from sb3_tdc.experiments.results import default_settings, same_settings, shorten_warm_up
 from sb3_tdc.experiments.suites import Cell
 from sb3_tdc.hyperparams import hyperparams_file, read_entry
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
@@ -75,6 +75,9 @@ def make_job(cell: Cell, seed: int, scale: float, logs: Path) -> Job:
     settings = {key: value for key, value in cell.settings.items() if not same_settings(implied.get(key), value)}
     variant = ",".join(f"{key}={value}" for key, value in settings.items())
     n_timesteps = max(round(scale * (cell.n_timesteps or entry["n_timesteps"])), 1)
+    if "learning_starts" in settings and entry.get("learning_starts"):  # as long as before, compared with the control's
+        shortened = shorten_warm_up(entry["learning_starts"], n_timesteps) / entry["learning_starts"]
+        settings["learning_starts"] = round(shortened * settings["learning_starts"])
     length = f"steps_{n_timesteps}" if cell.n_timesteps else f"scale_{scale:g}"
     return Job(
         cell.algo,

@@ -7,7 +7,7 @@ after Holm's correction for the number of variants with several seeds, under the
 steps, MuJoCo).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +17,8 @@ from sb3_tdc.ablations import ABLATIONS
 from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.experiments import statistics
 from sb3_tdc.experiments.groups import (
+    EVALUATION,
     Group,
-    as_shipped,
     by_conditions,
     have_same_settings,
     hyperparameters_not_shipped,
@@ -77,6 +77,7 @@ def compare_settings(groups: Sequence[Group]) -> list[Comparison]:
     """
     Return the comparisons of other hyperparameters with those of ``hyperparams/``, under all conditions.
 
+    Control and variant have the same other settings, if possible also the same interval and number of evaluations.
     Groups that differ only in λ or the head are left out: these have their own sections. So are groups with another
     task or another start, through arguments of the environment, wrappers, or a trained model.
     """
@@ -107,18 +108,31 @@ def _variants(finished: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
 
 
 def _other_settings(finished: Sequence[Group]) -> Iterator[tuple[Group, Group]]:
-    controls = {control.algo: control for control in as_shipped(finished)}
     for group in finished:
-        changed = {key.partition(".")[0] for key in hyperparameters_not_shipped(group.runs[0])}
-        of_algorithm = {*constructor_parameters(KNOWN_ALGORITHMS[group.algo]), *_OF_TRAINING}
-        if group.algo in controls and changed - {"lam", "stochastic_actor"} and changed <= of_algorithm:
-            yield group, controls[group.algo]
+        changed = hyperparameters_not_shipped(group.runs[0])
+        controls = [
+            control
+            for control in finished
+            if control.is_as_shipped
+            and control.algo == group.algo
+            and have_same_settings(group, control, but={*changed, *EVALUATION})
+        ]
+        if controls and _are_hyperparameters(group.algo, changed):
+            yield group, max(controls, key=lambda g: (have_same_settings(group, g, but=changed), len(g.finished)))
+
+
+def _are_hyperparameters(algo: str, changed: Iterable[str]) -> bool:
+    """Return whether the changed settings are the algorithm's or of its training, and not λ or the head alone."""
+    names = {key.partition(".")[0] for key in changed}
+    if algo not in KNOWN_ALGORITHMS or not names - {"lam", "stochastic_actor"}:
+        return False
+    return names <= {*constructor_parameters(KNOWN_ALGORITHMS[algo]), *_OF_TRAINING}
 
 
 def _is_control(control: Group, variant: Group) -> bool:
     if variant.algo in ("tdc", "tdc-auto"):
         is_zero = control.algo == "tdc" and control.setting("lam") == 0
-        return is_zero and have_same_settings(variant, control, but="lam")
+        return is_zero and have_same_settings(variant, control, but={"lam"})
     is_parent = variant.algo in ABLATIONS and control.algo == _parent(variant.algo)
     return is_parent and have_same_settings(variant, control)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_tdc.experiments.groups import (
+    as_shipped,
     by_conditions,
     describe,
     differences,
@@ -139,6 +140,32 @@ def test_as_shipped_whatever_the_length(tmp_path):
     assert found == {0: True, 1: True, 2: False, 3: False, 4: True}
     other = next(run for run in find_runs(tmp_path)[0] if run.seed == 3)
     assert is_as_shipped(other, but={"kappa"})
+
+
+def test_algorithms_are_shown_with_the_same_kind_of_warm_up(tmp_path):
+    """Two of three algorithms have a shortened one, 100 steps: so is TDC's, although it has more seeds without."""
+    for seed in (1, 2, 3):
+        make_run(tmp_path, seed=seed, learning_starts=5000)
+    for algo in ("tdc", "td3", "sac"):
+        make_run(tmp_path, algo)
+
+    def shown():
+        groups = group_runs(find_runs(tmp_path)[0])
+        return {group.algo: group.setting("learning_starts") for group in as_shipped(groups)}
+
+    assert shown() == {"tdc": 100, "td3": 100, "sac": 100}
+    make_run(tmp_path, "td3", learning_starts=5000)
+    make_run(tmp_path, "sac", learning_starts=5000)
+    assert shown() == {"tdc": 5000, "td3": 5000, "sac": 5000}
+
+
+def test_groups_of_a_task_have_different_names(tmp_path):
+    for args, warm_up in (({"eval_freq": 7}, 100), ({}, 5000), ({"eval_freq": 7}, 5000)):
+        make_run(tmp_path, lam=0.0, learning_starts=warm_up, args=args)
+        make_run(tmp_path, learning_starts=warm_up, args=args)
+    names = [group.name for group in group_runs(find_runs(tmp_path)[0])]
+    assert len(set(names)) == 6
+    assert "TDC, λ 0, learning_starts 100, eval_freq 7" in names
 
 
 def test_what_all_of_an_algorithm_have_is_said_once(tmp_path):

@@ -77,6 +77,13 @@ def test_scaled():
     assert "-params" not in cheetah(1).arguments  # nothing differs from hyperparams/
 
 
+def test_a_warm_up_that_a_suite_varies_is_shortened_like_that_of_its_control():
+    # Hopper-v4: the control's 5,000 random steps become 600, a tenth of 6,000; five times as many are 3,000
+    jobs = plan("hopper", scale=0.02, only=["td3"]).jobs
+    assert [(job.n_timesteps, job.config["learning_starts"]) for job in jobs] == [(6000, 3000)]
+    assert [job.config["learning_starts"] for job in plan("hopper", scale=1, only=["td3"]).jobs] == [25_000]
+
+
 def test_a_suite_of_a_length_of_its_own():
     jobs = plan("evidence", scale=1).jobs
     assert [(job.algo, job.env_id, job.settings) for job in jobs[:4]] == [

@@ -201,6 +201,26 @@ def test_other_settings_are_compared_with_those_of_the_file(tmp_path):
     }
 
 
+def test_other_settings_are_compared_with_the_same_warm_up(tmp_path):
+    """The matrix has shortened the warm-up of some runs, 5,000 steps, to 100: a difference that is not κ's."""
+    late = [(1.0, 2.0), (2.0, 3.0)]
+    make_runs(tmp_path, [*late, (9.0, 9.0)], learning_starts=5000)
+    make_runs(tmp_path, late)
+    make_runs(tmp_path, late, kappa=10.0)
+    make_runs(tmp_path, late, kappa=20.0, learning_starts=5000)
+    make_runs(tmp_path, late, kappa=40.0, args={"eval_freq": 7})  # how it is evaluated may differ
+    found = compare_settings(group_runs(find_runs(tmp_path)[0]))
+    of = {c.variant.setting("kappa"): (c.control.setting("learning_starts"), c.difference[0]) for c in found}
+    assert of == {10.0: (100, 0), 20.0: (5000, pytest.approx(2 - 13 / 3)), 40.0: (100, 0)}
+
+
+def test_algorithms_of_other_packages_are_compared_with_nothing(tmp_path):
+    make_runs(tmp_path, [(1.0, 2.0)], "a2c", n_steps=5)
+    make_runs(tmp_path, [(1.0, 2.0)], "a2c", n_steps=7)
+    groups = group_runs(find_runs(tmp_path)[0])
+    assert compare_settings(groups) == compare_variants(groups) == []
+
+
 def test_other_settings_are_in_the_report(tmp_path):
     pytest.importorskip("matplotlib")
     make_runs(tmp_path / "logs", [(1.0, 2.0), (2.0, 3.0)])
