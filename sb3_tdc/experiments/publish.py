@@ -49,6 +49,8 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     _mirror(source.path / test_returns.FILE, place / test_returns.FILE, test_returns.read_test_returns(run) is not None)
     for name in _SETTINGS:
         _mirror(source.path / source.env_name / name, target / name)
+    if run.is_finished and source.steps_at_end is None:  # of RL Zoo, whose model, which is not copied, tells it
+        (target / "finished.yml").write_text(plain_yaml.dump({"n_timesteps": run.steps}))
     relative = str(place.relative_to(folder).parents[1])
     arguments = {**source.args, "log_folder": relative}
     (target / "args.yml").write_text(plain_yaml.dump(arguments))

@@ -159,6 +159,14 @@ def test_test_returns_of_another_model_do_not_stay(logs, tmp_path):
     assert len(list(results.rglob("evaluations.npz"))) == 1
 
 
+def test_a_run_of_rl_zoo_stays_finished(tmp_path):
+    """It has no finished.yml: its model tells that it is finished, and models are not published."""
+    run = Run.open(make_run(tmp_path / "logs", "sac", steps=1000).path)
+    assert run.folder.steps_at_end is None
+    copy = Run.open(publishing.publish(run, tmp_path / "logs", tmp_path / "results"))
+    assert (copy.is_averaged, copy.steps) == (True, 1000)
+
+
 def test_a_run_without_a_log_is_published(logs, tmp_path):
     copy = tmp_path / "logs"
     shutil.copytree(logs, copy)
