@@ -186,7 +186,7 @@ class Report:
         section = Section(
             "Other settings",
             "Groups with other settings than those of hyperparams/, each next to the same algorithm as hyperparams/ "
-            "has it. λ and the head alone have sections of their own.",
+            "has it, if that was run with the same other settings. λ and the head alone have sections of their own.",
         )
         compared = compare_settings(self.groups)
         section.pictures += self.draw_comparisons("setting", compared)
@@ -232,8 +232,9 @@ class Report:
         return section
 
     def ablations(self, key: str) -> list[list[Group]]:
-        """Return lists of TDC groups that differ only in one setting."""
-        return vary([g for groups in self.conditions.values() for g in groups if g.algo == "tdc"], key)
+        """Return lists of TDC groups with evaluations that differ only in one setting."""
+        groups = (group for alike in self.conditions.values() for group in alike if group.algo == "tdc")
+        return vary([group for group in groups if any(run.evaluations for run in group.runs)], key)
 
     def td_errors(self) -> Section:
         section = Section(
@@ -322,7 +323,8 @@ class Report:
         section = Section(
             "The paper's claims",
             "What the paper says, against the runs that are here, on the tasks that it says it of, for each number "
-            "of steps and MuJoCo. A verdict needs 95 % intervals over seeds that do not overlap (Student's t for "
+            "of steps and MuJoCo. What it says of the spread of test episodes (Fig. 4) is drawn above and not "
+            "judged. A verdict needs 95 % intervals over seeds that do not overlap (Student's t for "
             "means, χ² for standard deviations over seeds). Returns are comparable, and heads interchangeable, if the "
             "intervals lie within a tenth of each other. Everything else is undecided: one seed decides nothing, and "
             f"fewer than {MIN_SEEDS_OF_SPREAD} decide nothing about a standard deviation over seeds.",

@@ -110,6 +110,21 @@ def test_heads_are_judged_as_the_paper_says_of_the_task(tmp_path):
     assert (found.says, found.verdict) == ("4. The heads are interchangeable", "held")
 
 
+def test_only_what_the_paper_compares_on_a_task_is_compared(tmp_path):
+    for algo in ("tdc", "td3", "sac"):
+        make_runs(tmp_path, range(10), algo, env_id="AntBulletEnv-v0")
+    assert set(compare(tmp_path)) == {("1", "mean", "TDC", "SAC")}
+
+
+def test_a_larger_lam_returns_more_on_humanoid(tmp_path):
+    for env_id in ("Humanoid-v4", "HalfCheetah-v4"):
+        for lam, finals in ((0.0, (1, 2, 3)), (0.25, (90, 91, 92)), (0.75, (11, 12, 13))):
+            make_runs(tmp_path, finals, env_id=env_id, lam=lam)
+    (found,) = (claim for claim in number(3, tmp_path) if "Humanoid" in claim.says)
+    assert (found.group.env_id, found.verdict) == ("Humanoid-v4", "held")
+    assert (found.ours.value, found.other.value) == (12, 2)
+
+
 def test_ablations_of_other_hyperparameters_say_nothing_of_the_paper(tmp_path):
     for lam in (0.0, 1.0):
         make_runs(tmp_path, (1, 2, 3), env_id="HalfCheetah-v4", lam=lam, kappa=5.0)

@@ -327,6 +327,13 @@ def test_runs_without_evaluations_have_no_figure(tmp_path):
     assert report.make_warnings(groups)[0].startswith("No run is finished and evaluated")
 
 
+def test_ablations_without_evaluations_have_no_figure(tmp_path):
+    for settings in ({"lam": 0.0}, {"lam": 0.5}, {"lam": 0.5, "stochastic_actor": True}):
+        (make_run(tmp_path / "logs", **settings).path / "evaluations.npz").unlink()
+    whole = sections.Report(read_groups(tmp_path / "logs"), tmp_path)
+    assert whole.lambda_sweep().pictures == whole.heads().pictures == []
+
+
 def test_tasks_of_one_length_are_one_row(tmp_path):
     def rows():
         table = tables.make_published_table(tables.make_returns_table(read_groups(tmp_path)))
