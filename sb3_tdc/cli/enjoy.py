@@ -262,9 +262,8 @@ def _filmed(env: VecEnv, args: argparse.Namespace, stack: ExitStack) -> VecEnv:
     """Wrap an environment so that it writes the video of ``--record``, if that is given."""
     if args.record is None:
         return env
-    fps = env.metadata.get("render_fps", 30)
-    assert isinstance(fps, (int, float))
-    return Filmed(env, stack.enter_context(VideoWriter(args.record, fps)))
+    (metadata,) = env.get_attr("metadata")  # of the environment: a wrapper of a VecEnv has its own
+    return Filmed(env, stack.enter_context(VideoWriter(args.record, metadata.get("render_fps") or 30)))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

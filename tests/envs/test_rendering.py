@@ -131,6 +131,7 @@ def runs(tmp_path_factory):
         argv = ["--env", f"{kind.__name__}-v0", "-n", "20", "-f", str(folder), "--eval-freq", "-1", *kwargs]
         assert train.main([*argv, "--verbose", "0", "-params", "policy_kwargs:{net_arch: [4]}"]) == 0
         found[kind.__name__] = folder / "tdc" / f"{kind.__name__}-v0_1"
+    gym.register("DrawnTogether-v0", vector_entry_point=drawn_together)
     return found
 
 
@@ -154,6 +155,28 @@ def test_every_environment_can_be_played(runs, name, said, monkeypatch, capsys):
 def test_what_draws_can_be_recorded(runs, name, tmp_path):
     assert enjoy.main([str(runs[name]), "--n-episodes", "1", "--record", str(tmp_path / "video.mp4")]) == 0
     assert (tmp_path / "video.mp4").stat().st_size > 100
+
+
+def drawn_together(num_envs=1, render_mode=None):
+    return gym.vector.SyncVectorEnv([lambda: Drawn(render_mode)] * num_envs, autoreset_mode="SameStep")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        ("Drawn-v0", []),
+        ("Drawn-v0", ["-params", "normalize:true"]),
+        ("Drawn-v0", ["-params", "frame_stack:2"]),
+        ("DrawnTogether-v0", ["--vec-env", "gymnasium"]),
+    ],
+)
+def test_a_video_runs_as_fast_as_the_environment(runs, tmp_path, env_id, options):
+    argv = ["--env", env_id, "-n", "20", "-f", str(tmp_path), "--eval-freq", "-1", "--verbose", "0", *options]
+    assert train.main([*argv, "-params", "policy_kwargs:{net_arch: [4]}"]) == 0
+    video = tmp_path / "video.mp4"
+    assert enjoy.main([str(tmp_path / "tdc" / f"{env_id}_1"), "--n-episodes", "1", "--record", str(video)]) == 0
+    about = imageio.get_reader(video).get_meta_data()
+    assert (about["fps"], about["duration"]) == (10, 1)  # 10 steps at render_fps 10
 
 
 @pytest.mark.parametrize("suffix", rendering.VIDEO_SUFFIXES)
