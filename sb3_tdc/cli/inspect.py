@@ -16,22 +16,27 @@ _KINDS = "zip of a model, a pickle of VecNormalize statistics or of a replay buf
 
 def inspect_run(path: Path) -> tuple[list[str], bool]:
     """
-    Describe a run folder, with its final and its best model.
+    Describe a run folder, with every model, statistics and replay buffer in it.
 
     :return: lines for the screen, and whether every file would be opened
     :raises ValueError: if it is not a run folder
     """
-    run = RunFolder.open(path)
+    run, algorithm = RunFolder.open(path), None
     lines, is_good = [f"{escaped(str(path))}: the folder of a run"], True
     try:
-        check_arguments(run.args, {str(run.args.get("algo"))}, str(path))
-        check_imports(run.args, run.config, (), str(path))
-        lines.append(f"  {escaped(json.dumps({name: run.args[name] for name in ('algo', 'env', 'gym_packages')}))}")
+        args = run.args
+        algorithm = KNOWN_ALGORITHMS.get(str(args.get("algo")))
+        check_arguments(args, KNOWN_ALGORITHMS, str(path))
+        check_imports(args, run.config, (), str(path))
+        lines.append(f"  {escaped(json.dumps({name: args[name] for name in ('algo', 'env', 'gym_packages')}))}")
     except ValueError as error:
         lines, is_good = [*lines, f"Refused: {escaped(str(error))}"], False
-    for model in [model for model in (run.model, run.best_model) if model.exists()]:
+    files = run.saved_files()
+    if not any(file.suffix == ".zip" for file in files):
+        lines, is_good = [*lines, "Refused: it has no models"], False
+    for file in files:
         try:
-            described, opens = inspect(model, KNOWN_ALGORITHMS.get(str(run.args.get("algo"))))
+            described, opens = inspect(file, algorithm)
         except ValueError as error:
             described, opens = [f"Refused: {escaped(str(error))}"], False
         lines, is_good = [*lines, "", *described], is_good and opens

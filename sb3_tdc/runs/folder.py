@@ -222,6 +222,11 @@ class RunFolder:
                 found[int(match[1])] = path
         return dict(sorted(found.items()))
 
+    def saved_files(self) -> list[Path]:
+        """Return all zips of models, then all pickles: statistics of ``VecNormalize`` and replay buffers."""
+        folders = (self.path, self.path / self.env_name)
+        return [file for end in ("zip", "pkl") for folder in folders for file in sorted(folder.glob(f"*.{end}"))]
+
     def normalization(self, model: Path) -> Path:
         """Return the path of the ``VecNormalize`` statistics of one of the run's models."""
         if model.name == self.best_model.name:

@@ -981,6 +981,46 @@ def test_statistics_buffers_and_folders_can_be_inspected(run, tmp_path, marker, 
     assert not marker.exists()
 
 
+def made_folder(folder, **args):
+    """Return the folder of a run that has no models yet."""
+    run = RunFolder.create(folder, "tdc", "Pendulum-v1")
+    run.write_config(
+        {"n_timesteps": 60}, {"algo": "tdc", "env": "Pendulum-v1", "gym_packages": [], "env_kwargs": {}, **args}
+    )
+    return run
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("Pendulum-v1.zip", "best_model.zip", "rl_model_20_steps.zip", "Pendulum-v1/trained_agent.zip"),
+        *("Pendulum-v1/vecnormalize.pkl", "best_model_vecnormalize.pkl", "rl_model_vecnormalize_20_steps.pkl"),
+        *("replay_buffer.pkl", "rl_model_replay_buffer_20_steps.pkl"),
+    ],
+)
+def test_every_file_of_a_folder_is_inspected(saved, tmp_path, marker, name, capsys):
+    run = made_folder(tmp_path)
+    shutil.copy(saved, run.model)
+    assert inspected(run.path, capsys)[0] == 0
+    if name.endswith(".zip"):
+        with_fields(saved, run.path / name, lam=serialized(Poison()))
+    else:
+        (run.path / name).write_bytes(pickle.dumps(Poison()))
+    status, out = inspected(run.path, capsys)
+    assert (status, out.count("Refused: "), marker.exists()) == (1, 1, False)
+    assert f"{run.path / name}: " in out
+    assert "builtins.exec" in out
+
+
+def test_a_folder_of_an_unknown_algorithm_or_without_models_is_refused(saved, tmp_path, capsys):
+    empty, unknown = made_folder(tmp_path), made_folder(tmp_path, algo="tcd")
+    assert inspected(empty.path, capsys)[0] == 1
+    shutil.copy(saved, unknown.model)
+    status, out = inspected(unknown.path, capsys)
+    assert (status, "algo must be one of tdc, " in out) == (1, True)
+    assert "Would be opened as a TDC of 60 steps." in out
+
+
 class ReplayBuffer:
     """A class named like SB3's, in another module, which SB3's own load would import."""
 
