@@ -1,10 +1,15 @@
 """TDC inside the real RL Zoo: training, enjoying, and Optuna search."""
 
+from collections import OrderedDict
+
 import pytest
+import yaml
 
 from sb3_tdc import MEOW, TDC, zoo
 from sb3_tdc.cli import train as our_train
 from sb3_tdc.hyperparams import hyperparams_file
+from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.settings import MAX_SEED
 
 rl_zoo3 = pytest.importorskip("rl_zoo3")
 
@@ -48,6 +53,36 @@ def test_zoo_enjoys_a_run_of_train_py(tmp_path, capsys):
     our_train.main(["--env", "Hopper-v4", "-n", "200", "-f", str(tmp_path), "--eval-freq", "100", "-params", *small])
     zoo.main(["enjoy", "--algo", "tdc", "--env", "Hopper-v4", "-f", str(tmp_path), "--no-render", "-n", "100"])
     assert "Mean reward" in capsys.readouterr().out
+
+
+@pytest.fixture
+def zoo_args(monkeypatch):
+    """Return the ``args.yml`` that RL Zoo's ``train`` writes, from its flags."""
+    train = pytest.importorskip("rl_zoo3.train")
+    parsed = []
+
+    def manager(args, *others, **kwargs):
+        parsed.append(vars(args))
+        raise KeyboardInterrupt
+
+    def write(*flags):
+        with pytest.raises(KeyboardInterrupt):
+            zoo.main(["train", *flags])
+        return yaml.dump(OrderedDict(sorted(parsed.pop().items())))
+
+    monkeypatch.setattr(train, "ExperimentManager", manager)
+    return write
+
+
+@pytest.mark.parametrize("seed", [1, MAX_SEED])
+def test_a_run_of_rl_zoo_starts_over(tmp_path, zoo_args, seed):
+    run = RunFolder.create(tmp_path, "tdc", "Pendulum-v1")
+    flags = ["--algo", "tdc", "--env", "Pendulum-v1", "--seed", str(seed), "--device", "cpu", "--eval-freq", "50"]
+    (run.path / "Pendulum-v1" / "args.yml").write_text(zoo_args(*flags))
+    config = OrderedDict(n_timesteps=100.0, policy_kwargs="dict(net_arch=[4])", learning_starts=90, batch_size=4)
+    (run.path / "Pendulum-v1" / "config.yml").write_text(yaml.dump(config))
+    assert our_train.main(["--resume", str(run.path), "--start-over"]) == 0
+    assert run.steps_at_end == 100
 
 
 def test_search(tmp_path):

@@ -17,8 +17,9 @@ from sb3_tdc.common.checks import check_device
 from sb3_tdc.resume import DEFAULT_FREQ
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 
-# NumPy accepts only seeds below 2**32, and environments are seeded with this seed plus a small number
-MAX_SEED = 2**31 - 1
+# NumPy accepts only seeds below 2**32, and environments are seeded with this seed plus a number of a few thousand
+MAX_SEED = 2**32 - 2**16
+MAX_RANDOM_SEED = 2**31 - 1  # some simulators take no larger one
 
 
 class Role(Enum):

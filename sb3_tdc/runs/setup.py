@@ -18,7 +18,15 @@ from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, 
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.runs.settings import MAX_SEED, Role, RunSettings, check_settings, default_of, flags_of, plain_arguments
+from sb3_tdc.runs.settings import (
+    MAX_RANDOM_SEED,
+    Role,
+    RunSettings,
+    check_settings,
+    default_of,
+    flags_of,
+    plain_arguments,
+)
 from sb3_tdc.runs.training import TrainingRun
 from sb3_tdc.safe_load.run_files import check_arguments
 
@@ -41,7 +49,7 @@ def make_run(settings: RunSettings) -> TrainingRun:
     settings.env, settings.gym_packages = split_env_id(settings.env, settings.gym_packages)
     _prepare(settings)
     if settings.seed < 0:
-        settings.seed = int(np.random.randint(MAX_SEED))
+        settings.seed = int(np.random.randint(MAX_RANDOM_SEED))
     hyperparams = read_hyperparams(settings)
     vars(settings).update(_absolute(vars(settings)))
     set_random_seed(settings.seed)
@@ -100,6 +108,16 @@ def _absolute(arguments: dict[str, Any]) -> dict[str, Any]:
     return {name: type(location)(abspath(location)) for name, location in locations.items()}
 
 
+def _as_stored(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings on a command line as the run that it began has stored them."""
+    stored = {**given, **_absolute(given)}
+    if ":" in stored.get("env", ""):
+        stored["env"], stored["gym_packages"] = split_env_id(stored["env"], stored.get("gym_packages", []))
+    if stored.get("seed") == -1:  # any seed
+        del stored["seed"]
+    return stored
+
+
 def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     """
     Open a run to resume it.
@@ -111,7 +129,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     folder = RunFolder.open(given["resume"])
     if not (folder.path / folder.env_name / "args.yml").is_file():
         raise ValueError(f"{folder.path} was stopped before its run began: start a new one")
-    settings = _resumed_settings(folder, {**given, **_absolute(given)})
+    settings = _resumed_settings(folder, _as_stored(given))
     where, config = str(folder.path / folder.env_name / "config.yml"), folder.config
     before = _stored_length(folder, where)
     length = before if (new := _new_length(given)) is None else new
@@ -206,6 +224,10 @@ def _stored_settings(folder: RunFolder, where: str) -> dict[str, Any]:
     stored = folder.args
     check_arguments(stored, KNOWN_ALGORITHMS, where)
     types = {declared.name: declared.type for declared in fields(RunSettings)}
-    # RL Zoo's file has further arguments, and null for those that were not given
-    known = {name: value for name, value in stored.items() if name in types and value is not None}
+    # RL Zoo's file has further arguments, and null or an empty path for those that were not given
+    known = {
+        name: value
+        for name, value in stored.items()
+        if name in types and value is not None and (value, types[name]) != ("", Path | None)
+    }
     return convert_mapping(known, types, where)

@@ -562,11 +562,11 @@ def test_enjoy_finds_what_train_made_of_an_environment_with_its_package(tmp_path
         sys.path.remove(str(tmp_path))
 
 
-@pytest.mark.parametrize("seed", [2**31, 4294967296, -2])
+@pytest.mark.parametrize("seed", [2**32 - 2**16 + 1, 4294967296, -2])
 def test_a_seed_out_of_range_leaves_no_folder(tmp_path, seed, capsys):
     with pytest.raises(SystemExit):
         run_train(tmp_path, seed=seed)
-    assert f"--seed must be 0 to 2147483647 (or -1: a random one), got {seed}" in capsys.readouterr().err
+    assert f"--seed must be 0 to 4294901760 (or -1: a random one), got {seed}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -591,7 +591,7 @@ def test_commands_that_are_printed_can_be_pasted(tmp_path, capsys):
         (["--record", "{file}/a.mp4"], "--record {file}/a.mp4 cannot be written: "),
         (["--record", "{folder}/a.xyz"], "the name must end in one of .mp4, "),
         (["--record", "{folder}"], "the name must end in one of .mp4, "),
-        (["--seed", "-1"], "--seed must be 0 to 2147483647, got -1"),
+        (["--seed", "-1"], "--seed must be 0 to 4294901760, got -1"),
     ],
 )
 def test_what_cannot_be_written_is_said_before_anything_is_played(spaced, tmp_path, flags, reason, capsys):

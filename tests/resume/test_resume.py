@@ -27,6 +27,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_tdc import TDC
+from sb3_tdc.cli import train
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.resume import LockedError, Restorable, ResumeCallback, callback, stored_steps
 from sb3_tdc.resume import run_state as state
@@ -261,6 +262,18 @@ def test_what_cannot_be_resumed_gets_one_sentence(stopped, tmp_path, capsys):
     assert "has no resume states" in fails(lambda: resume(stopped), capsys)
     (stopped / "Hopper-v4" / "args.yml").unlink()
     assert "was stopped before its run began" in fails(lambda: resume(stopped), capsys)
+
+
+def test_a_run_is_resumed_by_the_arguments_that_began_it(tmp_path, monkeypatch, capsys):
+    (tmp_path / "pendulums.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    began = ["--env", "pendulums:Pendulum-v1", "--gym-packages", "os", "-n", "120", "-f", str(tmp_path), "--seed", "-1"]
+    assert train.main([*began, "--device", "cpu", "--eval-freq", "-1", *SMALL]) == 0
+    run = tmp_path / "tdc" / "Pendulum-v1_1"
+    capsys.readouterr()
+    assert resume(run, *began) == 0
+    assert "is finished: there is nothing to resume" in capsys.readouterr().out
+    assert "--gym-packages ['math'] contradicts" in fails(lambda: resume(run, "--env", "math:Pendulum-v1"), capsys)
 
 
 def test_the_same_arguments_are_no_contradiction(stopped, whole):

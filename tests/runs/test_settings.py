@@ -21,7 +21,7 @@ from tests.helpers.training import fails
         ("--num-threads", 0, "at least 1 (or -1: at most two)"),
         ("--n-eval-envs", -1, "at least 1"),
         ("--verbose", -1, "at least 0"),
-        ("--seed", 2**31, "0 to 2147483647 (or -1: a random one)"),
+        ("--seed", 2**32 - 2**16 + 1, "0 to 4294901760 (or -1: a random one)"),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused(tmp_path, capsys, flag, value, allowed):
@@ -71,7 +71,7 @@ def run(tmp_path):
         ({"vec_env": "threads"}, "vec_env must be one of dummy, subproc, gymnasium, got 'threads'"),
         ({"trust": "yes"}, "trust must be true or false, got 'yes'"),
         ({"seed": -1}, "seed must be that of the run, got -1"),
-        ({"seed": 2**31}, "seed must be 0 to 2147483647 (or -1: a random one), got 2147483648"),
+        ({"seed": 2**32 - 2**16 + 1}, "seed must be 0 to 4294901760 (or -1: a random one), got 4294901761"),
         ({"device": "foo"}, "device must be one of auto, cpu"),
         ({"env_kwargs": [1]}, "env_kwargs must be a mapping, got "),
         ({"env": None}, "env must be a text, got nothing"),
