@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.checks import OFF_POLICY_LIMITS, Limits, check_within, suggest, unknown
+from sb3_tdc.common.exceptions import FAILURES, describe_exception
 from sb3_tdc.common.signatures import constructor_parameters
 
 # Keys that an entry may have in addition to the keyword arguments of the algorithm, with their types
@@ -382,6 +383,8 @@ def _import_class(name: Any, base: Any = object) -> type:
             found = getattr(importlib.import_module(module), attribute, None)
         except ModuleNotFoundError as error:
             raise ValueError(f"there is no module {error.name!r}") from error
+        except FAILURES as error:
+            raise ValueError(describe_exception(error)) from error
         if isinstance(found, type) and (not isinstance(base, type) or issubclass(found, base)):
             return found
     raise ValueError(f"{name!r} names no {getattr(base, '__name__', base)} class")

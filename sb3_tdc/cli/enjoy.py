@@ -236,7 +236,7 @@ def _play_or_explain(args: argparse.Namespace, given: Collection[str]) -> int:
             print(sentence)
 
     with ExitStack() as stack:
-        env = trained.make_env(args.seed, **env_kwargs)
+        env = trained.make_env(args.seed, env_kwargs)
         stack.callback(env.close)
         for unwrapped in env.get_attr("unwrapped"):
             follow_agent(unwrapped)

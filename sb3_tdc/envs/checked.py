@@ -16,10 +16,10 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_tdc.common.exceptions import FAILURES, describe_exception
+
 _SECONDS_TO_DIE = 5.0
 _FAULT = "sb3_tdc.fault"  # in the `info` that a process sends
-# An environment that calls sys.exit() must not end a run as if it had succeeded
-_FAILURES = (Exception, SystemExit)
 
 
 class EnvironmentFaultError(RuntimeError):
@@ -33,14 +33,6 @@ class EnvironmentFaultError(RuntimeError):
     def __init__(self, sentence: str, details: str = ""):
         super().__init__(sentence)
         self.details = details
-
-
-def describe_exception(error: BaseException) -> str:
-    """Return the type, the message and the place of an exception, in one line."""
-    message = " ".join(str(error).split())
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}{f': {message}' if message else ''}{place}"
 
 
 class CheckedEnv(gym.Wrapper):
@@ -73,17 +65,23 @@ class CheckedEnv(gym.Wrapper):
         _check_info("step", info)
         return result
 
+    def render(self) -> Any:
+        picture = self._call("render")
+        if self.render_mode == "rgb_array" and _as_array(picture).ndim != 3:
+            _refuse("render() must return an array (height, width, 3) in the mode rgb_array", picture)
+        return picture
+
     def close(self) -> None:
         """Close the environment; an error becomes a warning, as training is over."""
         try:
             super().close()
-        except _FAILURES as error:
+        except FAILURES as error:
             warnings.warn(f"close() of the environment raised {describe_exception(error)}", stacklevel=2)
 
     def _call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         try:
             return getattr(self.env, name)(*args, **kwargs)
-        except _FAILURES as error:
+        except FAILURES as error:
             sentence = f"{name}() raised {describe_exception(error)}"
             raise EnvironmentFaultError(sentence, traceback.format_exc()) from error
 
@@ -166,13 +164,13 @@ class _Reporting(gym.Wrapper):
     def reset(self, **kwargs: Any) -> Any:
         try:
             return super().reset(**kwargs)
-        except _FAILURES as error:
+        except FAILURES as error:
             return self.observation_space.sample(), {_FAULT: _Fault.of(error)}
 
     def step(self, action: Any) -> Any:
         try:
             return super().step(action)
-        except _FAILURES as error:
+        except FAILURES as error:
             return self.observation_space.sample(), 0.0, False, False, {_FAULT: _Fault.of(error)}
 
     def get_wrapper_attr(self, name: str) -> Any:
@@ -185,7 +183,7 @@ class _Reporting(gym.Wrapper):
         def report(*args: Any, **kwargs: Any) -> Any:
             try:
                 return value(*args, **kwargs)
-            except _FAILURES as error:
+            except FAILURES as error:
                 return _Fault.of(error)
 
         return report
@@ -203,7 +201,7 @@ class _Unmade(gym.Env):
 def _make_reporting(make_env: Callable[[], gym.Env]) -> gym.Env:
     try:
         return _Reporting(make_env())
-    except _FAILURES as error:
+    except FAILURES as error:
         return _Unmade(_Fault.of(error))
 
 

@@ -9,7 +9,8 @@ import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_tdc.envs.checked import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError, describe_exception
+from sb3_tdc.common.exceptions import describe_exception
+from sb3_tdc.envs.checked import CheckedEnv, CheckedSubprocVecEnv, EnvironmentFaultError
 from sb3_tdc.envs.mujoco import print_warnings_once
 from sb3_tdc.envs.processes import ignore_signals
 from sb3_tdc.envs.registry import has_vector_env, simulator_of

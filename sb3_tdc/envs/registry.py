@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import gymnasium as gym
 
+from sb3_tdc.common.exceptions import FAILURES, describe_exception
 from sb3_tdc.envs.isaac import ISAAC
 from sb3_tdc.envs.mujoco import check_opengl
 from sb3_tdc.envs.pybullet import PYBULLET
@@ -36,24 +37,34 @@ def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
 
     :param packages: packages that are named elsewhere
     :return: the environment's id without the package, and all packages
+    :raises ValueError: if a package is not the name of a module
     """
     package, _, env_id = env_id.rpartition(":")
-    return env_id, [*packages, *([package] if package and package not in packages else [])]
+    packages = [*packages, *([package] if package and package not in packages else [])]
+    for package in packages:
+        if not all(part.isidentifier() for part in package.split(".")):
+            raise ValueError(
+                f"--gym-packages takes names of modules, got {package!r}: a run folder goes before this flag"
+            )
+    return env_id, packages
 
 
 def import_packages(packages: Sequence[str]) -> None:
     """
     Import packages that register environments.
 
-    :raises ValueError: if a package or one of its imports is not installed, with the command that installs it
+    :raises ValueError: if a package or one of its imports is not installed, with the remedy, or raises an exception
     """
     for package in packages:
         try:
             importlib.import_module(package)
         except ModuleNotFoundError as error:
             raise ValueError(
-                f"--gym-packages {package}: there is no module {error.name!r}: pip install {error.name}"
+                f"--gym-packages {package}: there is no module {error.name!r}: "
+                f"if it is a file of yours, put its folder on PYTHONPATH; otherwise pip install {error.name}"
             ) from error
+        except FAILURES as error:
+            raise ValueError(f"--gym-packages {package}: {describe_exception(error)}") from error
 
 
 def require_env(env_id: str) -> None:

@@ -15,7 +15,8 @@ from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_tdc.envs.checked import describe_exception
+from sb3_tdc.common.exceptions import describe_exception
+from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.registry import is_of_mujoco
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".mkv", ".mov", ".avi")
@@ -189,9 +190,12 @@ class Filmed(VecEnvWrapper):
     A wrapper that writes a frame to a video before every step.
 
     :param venv: one environment, made with ``render_mode="rgb_array"``
+    :raises EnvironmentFaultError: if the environment does not know its ``render_mode``
     """
 
     def __init__(self, venv: VecEnv, video: VideoWriter):
+        if venv.render_mode is None:
+            raise EnvironmentFaultError("it draws nothing: its constructor must set self.render_mode")
         super().__init__(venv)
         self.video = video
 

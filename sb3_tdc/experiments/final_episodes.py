@@ -75,7 +75,7 @@ def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()
     check_writable("Test returns:", path)
     before = checksum(run)
     trained = open_run(run.folder, run.folder.model, packages, trust)
-    env = trained.make_env(FIRST_SEED, **(trained.eval_env_kwargs or trained.env_kwargs))
+    env = trained.make_env(FIRST_SEED, trained.eval_env_kwargs or trained.env_kwargs)
     with closing(env):
         returns = play_final_episodes(trained.load(env, "cpu"), env, episodes)
     contents: dict[str, Any] = {"returns": returns, "checksum": before, "first_seed": FIRST_SEED}

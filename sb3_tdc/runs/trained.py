@@ -8,6 +8,7 @@ from typing import Any
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdc.common.exceptions import describe_exception
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
@@ -47,7 +48,7 @@ class TrainedModel:
     trust: bool = False
     vec_env: str = "dummy"
 
-    def make_env(self, seed: int, **env_kwargs: Any) -> VecEnv:
+    def make_env(self, seed: int, env_kwargs: dict[str, Any]) -> VecEnv:
         """
         Make one environment as in training, but with fixed normalisation statistics and unnormalised rewards.
 
@@ -68,8 +69,9 @@ class TrainedModel:
             )
         except EnvironmentFaultError as error:
             raise ValueError(str(error)) from error
-        except SETUP_ERRORS as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
+        except Exception as error:
+            is_a_sentence = isinstance(error, SETUP_ERRORS) and str(error)
+            reason = " ".join(str(error).split()) if is_a_sentence else describe_exception(error)
             raise ValueError(f"{self.env_id} cannot be made: {reason}") from error
 
     def load(self, env: VecEnv | None, device: str) -> OffPolicyAlgorithm:

@@ -27,6 +27,7 @@ from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import load_normalization
 from tests.helpers.command_line import SMALL, SMALL_ANY, run_enjoy, run_train
 from tests.helpers.paths import ROOT
+from tests.helpers.training import fails
 
 
 def tags(folder):
@@ -446,7 +447,12 @@ def test_a_diverged_run_keeps_what_was_saved(tmp_path, capsys):
         (["-params", "policy:os.path"], "policy: 'os.path' names no BasePolicy class"),
         (["-params", "env_wrapper:{gymnasium.wrappers.TimeLimit: 100}"], "env_wrapper must name a class, or map it"),
         (["--eval-episodes", "0"], "--eval-episodes must be at least 1, got 0"),
-        (["--gym-packages", "no_such_package"], "there is no module 'no_such_package': pip install no_such_package"),
+        (
+            ["--gym-packages", "no_such_package"],
+            "no module 'no_such_package': if it is a file of yours, put its folder on PYTHONPATH; otherwise pip "
+            "install no_such_package",
+        ),
+        (["--gym-packages", "./logs"], "--gym-packages takes names of modules, got './logs'"),
         (["--env", "CartPole-v1"], "env must have a Box action space"),
         (["--env-kwargs", "colour:red"], "colour"),
         (["--device", "gpu"], "--device must be one of auto, cpu"),
@@ -481,6 +487,28 @@ def test_what_the_user_has_written_is_named_with_its_place(tmp_path, key, monkey
     reason = f"AttributeError: 'Part' object has no attribute 'name' ({tmp_path / 'my_own.py'}, line 3)"
     assert capsys.readouterr().err == f"sb3-tdc train: error: {reason}\n"
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        ("from os import nothing", "ImportError: cannot import name 'nothing' from 'os' ("),
+        ("\nmissing", "NameError: name 'missing' is not defined ({file}, line 2)\n"),
+        ("def (", "SyntaxError: invalid syntax (broken.py, line 1)\n"),
+        ("raise SystemExit(0)", "SystemExit: 0 ({file}, line 1)\n"),
+    ],
+    ids=lambda value: value.strip()[:9],
+)
+def test_a_module_that_fails_is_named_with_its_place(tmp_path, code, reason, monkeypatch, capsys):
+    (tmp_path / "broken.py").write_text(code)
+    (tmp_path / "model.zip").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    for call, place in (
+        (lambda: run_train(tmp_path, "--gym-packages", "broken"), "--gym-packages broken: "),
+        (lambda: run_enjoy(tmp_path / "model.zip", "--env", "broken:Broken-v0"), "--gym-packages broken: "),
+        (lambda: run_train(tmp_path, "-params", "env_wrapper:broken.Wrapper"), "to its keyword arguments: "),
+    ):
+        assert f"{place}{reason.format(file=tmp_path / 'broken.py')}" in fails(call, capsys)
 
 
 def test_a_missing_package_gets_its_command(tmp_path, capsys, monkeypatch):

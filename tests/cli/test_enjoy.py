@@ -3,6 +3,7 @@
 import re
 import shutil
 from contextlib import nullcontext
+from typing import ClassVar
 
 import gymnasium as gym
 import pytest
@@ -13,6 +14,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_tdc.advb import AdvBTD3
 from sb3_tdc.cli import enjoy
 from sb3_tdc.common.playing import play_episodes
+from sb3_tdc.experiments.final_episodes import measure_run
+from sb3_tdc.experiments.results import Run
 from tests.helpers.command_line import SMALL, SMALL_ANY, run_enjoy, run_train
 from tests.helpers.training import fails
 
@@ -75,6 +78,31 @@ def test_a_file_outside_a_run_says_nothing_of_its_environment(lone, capsys):
 
 def test_a_file_that_is_not_there(tmp_path, capsys):
     assert f"{tmp_path / 'missing.zip'} does not exist" in refused(capsys, tmp_path / "missing.zip")
+
+
+def test_a_run_folder_after_the_packages_is_no_package(run, capsys):
+    assert f"--gym-packages takes names of modules, got '{run}': a run folder goes before this flag" in refused(
+        capsys, "--gym-packages", "os", run
+    )
+
+
+class Seeded(PendulumEnv):
+    """Takes an argument with the name of one of ours."""
+
+    seeds: ClassVar = []
+
+    def __init__(self, seed=0, render_mode=None):
+        super().__init__(render_mode)
+        self.seeds.append(seed)
+
+
+def test_a_constructor_may_take_a_seed(tmp_path):
+    gym.register("Seeded-v0", Seeded, max_episode_steps=10)
+    assert run_train(tmp_path, "--env-kwargs", "seed:3", "--verbose", 0, env="Seeded-v0", n=120) == 0
+    run = tmp_path / "tdc" / "Seeded-v0_1"
+    assert run_enjoy(run) == 0
+    assert len(measure_run(Run.open(run), episodes=1)) == 1
+    assert set(Seeded.seeds) == {3}
 
 
 def test_one_episode_is_one(run, capsys):

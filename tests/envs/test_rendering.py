@@ -120,12 +120,27 @@ class Fails(Undrawn):
         super().__init__()
 
 
+class Forgets(Drawn):
+    def __init__(self, render_mode=None):
+        super().__init__()
+
+
+class DrawsNothing(Drawn):
+    def render(self):
+        return None
+
+
+class DrawsBadly(Drawn):
+    def render(self):
+        raise RuntimeError("no paint")
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """A run on each of the environments above, by the name of its class."""
     folder = tmp_path_factory.mktemp("runs")
     found = {}
-    for kind in (Undrawn, Drawn, NeedsPictures, Fails):
+    for kind in (Undrawn, Drawn, NeedsPictures, Fails, Forgets, DrawsNothing, DrawsBadly):
         gym.register(f"{kind.__name__}-v0", kind)
         kwargs = ["--env-kwargs", "render_mode:rgb_array"] if kind is NeedsPictures else []
         argv = ["--env", f"{kind.__name__}-v0", "-n", "20", "-f", str(folder), "--eval-freq", "-1", *kwargs]
@@ -206,6 +221,19 @@ def test_what_does_not_draw_cannot_be_recorded_and_says_so(runs, tmp_path, capsy
     with pytest.raises(SystemExit):
         enjoy.main([str(runs["Undrawn"]), "--record", str(tmp_path / "video.mp4")])
     assert "Undrawn-v0 cannot be recorded: it draws nothing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Forgets", "it draws nothing: its constructor must set self.render_mode\n"),
+        ("DrawsNothing", "render() must return an array (height, width, 3) in the mode rgb_array, got None\n"),
+        ("DrawsBadly", "render() raised RuntimeError: no paint ("),
+    ],
+)
+def test_a_picture_that_is_none_is_a_sentence(runs, tmp_path, name, sentence, capsys):
+    assert enjoy.main([str(runs[name]), "--record", str(tmp_path / "video.mp4")]) == 1
+    assert f"error: the environment failed: {sentence}" in capsys.readouterr().err
 
 
 def test_an_environment_that_cannot_be_made_is_a_sentence(runs, monkeypatch, capsys):
