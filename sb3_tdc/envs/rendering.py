@@ -48,7 +48,7 @@ def render_modes(env_id: str) -> set[str]:
     if not any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
         return set()
     metadata = getattr(creator, "metadata", None) or {}  # a function has no metadata: assume both modes
-    return set(metadata.get("render_modes", ("human", "rgb_array")))
+    return set(metadata.get("render_modes", ("human", "rgb_array"))) - {None}  # Isaac Lab lists None, too
 
 
 def display_works() -> bool:

@@ -120,6 +120,10 @@ class Fails(Undrawn):
         super().__init__()
 
 
+class DrawnOrNot(Drawn):
+    metadata: ClassVar = {"render_modes": [None, "rgb_array"]}
+
+
 class Forgets(Drawn):
     def __init__(self, render_mode=None):
         super().__init__()
@@ -140,7 +144,7 @@ def runs(tmp_path_factory):
     """A run on each of the environments above, by the name of its class."""
     folder = tmp_path_factory.mktemp("runs")
     found = {}
-    for kind in (Undrawn, Drawn, NeedsPictures, Fails, Forgets, DrawsNothing, DrawsBadly):
+    for kind in (Undrawn, Drawn, DrawnOrNot, NeedsPictures, Fails, Forgets, DrawsNothing, DrawsBadly):
         gym.register(f"{kind.__name__}-v0", kind)
         kwargs = ["--env-kwargs", "render_mode:rgb_array"] if kind is NeedsPictures else []
         argv = ["--env", f"{kind.__name__}-v0", "-n", "20", "-f", str(folder), "--eval-freq", "-1", *kwargs]
@@ -155,6 +159,7 @@ def runs(tmp_path_factory):
     [
         ("Undrawn", "No window: it draws nothing\n"),
         ("Drawn", "There is no display: no window. To see the agent: --record FILE.mp4\n"),
+        ("DrawnOrNot", "There is no display: no window. To see the agent: --record FILE.mp4\n"),
         ("NeedsPictures", "No window: it is made with render_mode rgb_array. To see the agent: --record FILE.mp4\n"),
     ],
 )
