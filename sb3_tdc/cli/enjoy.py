@@ -21,7 +21,7 @@ from sb3_tdc.common.playing import play_episodes
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.common.words import count
 from sb3_tdc.envs.checked import EnvironmentFaultError
-from sb3_tdc.envs.registry import import_packages, split_env_id
+from sb3_tdc.envs.registry import split_env_id
 from sb3_tdc.envs.rendering import VIDEO_SUFFIXES, Filmed, VideoWriter, choose_render_mode, follow_agent
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.explaining import explain, explanation_path, extend_time_limit
@@ -135,8 +135,7 @@ def _open_file(args: argparse.Namespace, given: Collection[str]) -> TrainedModel
             raise ValueError(
                 f"{args.run} is not in the folder of a run: say with --env what it was trained on"
             ) from None
-        import_packages(args.gym_packages)
-        return open_zip(args.run, args.algo, args.env, args.trust)
+        return open_zip(args.run, args.algo, args.env, args.gym_packages, args.trust)
     return open_run(run, args.run, args.gym_packages, args.trust)
 
 

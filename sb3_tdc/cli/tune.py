@@ -13,7 +13,7 @@ from sb3_tdc.common.commands import command
 from sb3_tdc.common.files import check_can_be_made, lock, numbered, write_atomically
 from sb3_tdc.common.output import harmless_output
 from sb3_tdc.common.words import count
-from sb3_tdc.envs.registry import import_packages, split_env_id
+from sb3_tdc.envs.registry import split_env_id
 from sb3_tdc.experiments.jobs import Job, cluster, eval_freq
 from sb3_tdc.experiments.ranking import write_results
 from sb3_tdc.experiments.search import make_candidate_jobs
@@ -157,7 +157,6 @@ def _search(args: argparse.Namespace, given: dict[str, Any]) -> int:
         _read_arguments(args, given)
     typed = plain_arguments(vars(args))
     args.env, args.gym_packages = split_env_id(args.env, args.gym_packages)
-    import_packages(args.gym_packages)
     if args.resume is None:
         args.folder = _make_folder(args)
     candidates = make_candidate_jobs(args)

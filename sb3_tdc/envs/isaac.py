@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import gymnasium as gym
@@ -80,18 +81,33 @@ def _is_same(last: Any, observations: Any, i: int) -> bool:
     return bool(np.array_equal(last, observations[i], equal_nan=True))
 
 
-def register() -> None:
+@cache  # a process can start it only once
+def start() -> None:
     """
-    Start Isaac Lab's application, without which the tasks cannot be imported, and register the tasks.
+    Start Isaac Lab's application, without which no task can be imported.
 
     :raises ValueError: if Isaac Lab is not installed, with the address of the installation guide
     """
-    try:
+    with _requiring_isaac_lab(), _without_arguments():
         if not _is_installed():
             raise ModuleNotFoundError(name="isaaclab_tasks")
-        with _without_arguments():
-            importlib.import_module("isaaclab.app").AppLauncher(headless=True)
+        importlib.import_module("isaaclab.app").AppLauncher(headless=True)
+
+
+def register() -> None:
+    """
+    Register Isaac Lab's own tasks.
+
+    :raises ValueError: if Isaac Lab is not installed, with the address of the installation guide
+    """
+    with _requiring_isaac_lab():
         importlib.import_module("isaaclab_tasks")
+
+
+@contextmanager
+def _requiring_isaac_lab() -> Iterator[None]:
+    try:
+        yield
     except ImportError as error:
         raise ValueError(f"Isaac Lab's environments need Isaac Lab and Isaac Sim ({error.name}): {_INSTALL}") from error
 
@@ -142,4 +158,4 @@ def _set(config: Any, name: str, value: Any, env_id: str) -> None:
     setattr(config, last, value)
 
 
-ISAAC = Simulator(provides=lambda env_id: env_id.startswith("Isaac-"), register=register, make_vec=make_vec)
+ISAAC = Simulator(lambda env_id: env_id.startswith("Isaac-"), start, register, make_vec=make_vec)

@@ -49,7 +49,7 @@ def split_env_id(env_id: str, packages: Sequence[str]) -> tuple[str, list[str]]:
     return env_id, packages
 
 
-def import_packages(packages: Sequence[str]) -> None:
+def _import_packages(packages: Sequence[str]) -> None:
     """
     Import packages that register environments.
 
@@ -67,15 +67,18 @@ def import_packages(packages: Sequence[str]) -> None:
             raise ValueError(f"--gym-packages {package}: {describe_exception(error)}") from error
 
 
-def require_env(env_id: str) -> None:
+def require_env(env_id: str, packages: Sequence[str] = ()) -> None:
     """
-    Let the simulator of an environment register it, and check that it is registered.
+    Import the packages that register an environment, or let its simulator register it, and check that it is registered.
 
-    :raises ValueError: if the simulator is not installed, with the command that installs it; if MuJoCo finds no
-        OpenGL; if there is no such environment, with the ids closest to it
+    :raises ValueError: if the simulator or a package is not installed, with the command that installs it; if a package
+        raises an exception; if MuJoCo finds no OpenGL; if there is no such environment, with the ids closest to it
     """
+    simulator = simulator_of(env_id)
+    simulator.start()
+    _import_packages(packages)
     if env_id not in gym.registry:
-        simulator_of(env_id).register()
+        simulator.register()
     if env_id in gym.registry:
         if is_of_mujoco(env_id):
             check_opengl()

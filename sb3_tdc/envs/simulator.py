@@ -9,7 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 
 
-def _register_nothing() -> None:
+def _do_nothing() -> None:
     pass
 
 
@@ -20,17 +20,20 @@ def _make(spec: EnvSpec, env_kwargs: dict[str, Any]) -> gym.Env:
 @dataclass(frozen=True)
 class Simulator:
     """
-    The functions that register and make the environments of one simulator.
+    The functions that start one simulator, and register and make its environments.
 
     :param provides: returns whether an environment id belongs to the simulator
-    :param register: registers its environments; raises ``ValueError``, with the install command, if it is not installed
+    :param start: starts its application, unless it runs already: custom environments are imported after that
+    :param register: registers its environments; raises ``ValueError``, as ``start``, with the install command, if it is
+        not installed
     :param make: makes one environment, given its registered spec and the constructor's arguments
     :param make_vec: only for a simulator that makes all environments of a process at once, and only once; takes the id,
         the number of environments, the seed and the constructor's arguments
     """
 
     provides: Callable[[str], bool]
-    register: Callable[[], None] = _register_nothing
+    start: Callable[[], None] = _do_nothing
+    register: Callable[[], None] = _do_nothing
     make: Callable[[EnvSpec, dict[str, Any]], gym.Env] = _make
     make_vec: Callable[[str, int, int, dict[str, Any]], VecEnv] | None = None
 

@@ -27,7 +27,7 @@ def make_candidate_jobs(args: argparse.Namespace) -> list[list[Job]]:
             raise ValueError(f"{'-n' if name == 'n_timesteps' else f'--{name}'} must be at least 1, got {value}")
     if simulator_of(args.env).make_vec is not None:
         raise ValueError(f"{args.env} has no evaluations by which candidates could be compared")
-    require_env(args.env)
+    require_env(args.env, args.gym_packages)
     space = parse_space(args.search)
     if not space:
         if "lam" not in constructor_hints(KNOWN_ALGORITHMS[args.algo]):

@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.threads import set_threads
-from sb3_tdc.envs.registry import import_packages, require_env, split_env_id
+from sb3_tdc.envs.registry import require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
@@ -78,8 +78,7 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
 
 def _prepare(settings: RunSettings) -> None:
     """Set up this process: import the packages that register environments, and set the number of threads."""
-    import_packages(settings.gym_packages)
-    require_env(settings.env)
+    require_env(settings.env, settings.gym_packages)
     set_threads(settings.num_threads)
 
 

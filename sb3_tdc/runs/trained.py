@@ -12,7 +12,7 @@ from sb3_tdc.common.exceptions import describe_exception
 from sb3_tdc.common.untrusted import escaped
 from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
-from sb3_tdc.envs.registry import has_vector_env, import_packages, require_env, split_env_id
+from sb3_tdc.envs.registry import has_vector_env, require_env, split_env_id
 from sb3_tdc.hyperparams import Hyperparams, parse
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
@@ -128,8 +128,7 @@ def open_run(run: RunFolder, path: Path, consented: Sequence[str] = (), trust: b
     if not trust:
         check_imports(trained, config, consented, str(run.path))
     env_id, packages = split_env_id(trained["env"], [*trained["gym_packages"], *consented])
-    import_packages(packages)
-    require_env(env_id)
+    require_env(env_id, packages)
     of_the_environment = {key: value for key, value in config.items() if key in _OF_THE_ENVIRONMENT}
     gamma = {"gamma": config["gamma"]} if "gamma" in config else {}
     where = str(run.path / run.env_name / "config.yml")
@@ -155,7 +154,7 @@ def flags_to_open(runs: Iterable[RunFolder]) -> list[str]:
     return [*(["--gym-packages", *modules] if modules else []), *(["--trust"] if trust else [])]
 
 
-def open_zip(path: Path, algo: str, env_id: str, trust: bool = False) -> TrainedModel:
-    """Return a model outside a run folder, with the algorithm and the registered environment that the user names."""
-    require_env(env_id)
+def open_zip(path: Path, algo: str, env_id: str, packages: Sequence[str] = (), trust: bool = False) -> TrainedModel:
+    """Return a model outside a run folder, with the algorithm, environment and packages that the user names."""
+    require_env(env_id, packages)
     return TrainedModel(path, algo, env_id, parse({"n_timesteps": 1}, KNOWN_ALGORITHMS[algo], str(path)), trust=trust)

@@ -8,6 +8,7 @@ import pytest
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_tdc import TDC
+from sb3_tdc.cli import enjoy
 from sb3_tdc.cli.train import main
 from sb3_tdc.envs import isaac
 from sb3_tdc.envs.registry import require_env
@@ -112,6 +113,29 @@ def test_train(monkeypatch, tmp_path, capsys):
     assert (run / f"{TASK}.zip").is_file()
     assert len((run / "0.monitor.csv").read_text().splitlines()) > 2000
     gym.registry.pop(TASK, None)
+
+
+REGISTER = """
+import gymnasium as gym
+gym.register("Isaac-Mine-v0", "tests.helpers.isaac:ReachTask", disable_env_checker=True, order_enforce=False)
+"""
+
+
+@pytest.mark.parametrize("imports", ["", "import isaaclab_tasks"])
+def test_a_custom_task_is_imported_after_the_application_has_started_once(monkeypatch, tmp_path, imports, capsys):
+    launched = install(monkeypatch, "action_bounds")
+    (tmp_path / "my_tasks.py").write_text(imports + REGISTER)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_tasks", raising=False)
+    flags = ["--env", "Isaac-Mine-v0", "--gym-packages", "my_tasks", "-f", str(tmp_path)]
+    try:
+        assert main([*flags, "-n", "40", "--verbose", "0", "-params", "n_envs:2"]) == 0
+        assert enjoy.main([*flags, "--n-episodes", "1", "--no-render"]) == 0
+    finally:
+        gym.registry.pop("Isaac-Mine-v0", None)
+        gym.registry.pop(TASK, None)
+    assert "mean ± std of 1 episode" in capsys.readouterr().out
+    assert len(launched) == 1
 
 
 def test_a_resumed_run_begins_new_episodes(monkeypatch, tmp_path):

@@ -15,6 +15,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tdc.envs import isaac
+
 TASK = "Isaac-Reach-Stand-In-v0"
 INTERFACES = ("fast_variant", "action_low, action_high", "action_bounds")
 LIMIT = 5
@@ -162,6 +164,7 @@ def install(monkeypatch, interface):
     :return: for each application that is launched, its keyword arguments and ``sys.argv`` as it saw it
     """
     launched = []
+    isaac.start.cache_clear()
 
     class AppLauncher:
         def __init__(self, launcher_args=None, **kwargs):
