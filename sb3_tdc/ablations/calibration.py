@@ -52,10 +52,11 @@ def calibrate(lam: float, scale: float, errors: np.ndarray, least: float) -> tup
 
 def updates_before(tau: float, gamma: float) -> float:
     """
-    Return the number of updates after which a calibration begins: 1/(τ·(1 − γ)).
+    Return the number of updates after which a calibration begins: 1/(τ·(1 − γ)); infinity if τ is 0.
 
     The values of new networks take about this many updates to grow to their full size: a target follows in about 1/τ
-    updates, and values depend on one another over 1/(1 − γ) steps. Until then they are too small, but not because of λ.
+    updates, and values depend on one another over 1/(1 − γ) steps, here at most ``_MAX_HORIZON``. Until then they are
+    too small, but not because of λ.
     """
     horizon = min(1 / (1 - gamma), _MAX_HORIZON) if gamma < 1 else _MAX_HORIZON
     return horizon / tau if tau > 0 else math.inf

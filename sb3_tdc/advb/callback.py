@@ -19,7 +19,8 @@ class BoardCallback(BaseCallback):
     :param eval_env: one separate environment, wrapped like the training environment; if it normalises, it uses the
         training environment's statistics and does not normalise rewards
     :param verbose: 1 prints every new member
-    :raises ValueError: when training begins, if only one of the two environments is wrapped in ``VecNormalize``
+    :raises ValueError: if ``eval_env`` has more than one environment; when training begins, if only one of the two
+        is wrapped in ``VecNormalize``
     """
 
     def __init__(self, eval_env: VecEnv, verbose: int = 0):

@@ -78,7 +78,7 @@ def numbered(parent: Path, name: str) -> dict[int, Path]:
 
 def lock(path: Path) -> Any:
     """
-    Lock a file until it is closed; create it if it does not exist.
+    Lock a file until it is closed; create it if it does not exist. On Windows the file is opened, but not locked.
 
     :return: the open file; None if another process has locked it
     """

@@ -183,7 +183,7 @@ def _warn_of_code(data: dict[str, Any], custom_objects: dict[str, Any], budget: 
             found = [f"something that cannot be read ({error})"]
         if found:
             warnings.warn(
-                f"The field {shown(name)} is not read here, but SB3's load would run code for it: "
+                f"The field {shown(name)} is not used here, but SB3's load would run code for it: "
                 f"{', '.join(found[:3])}{' …' if len(found) > 3 else ''}",
                 RuntimeWarning,
                 stacklevel=2,

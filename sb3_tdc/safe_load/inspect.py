@@ -113,5 +113,5 @@ def _describe_pickle(path: Path, size: int) -> tuple[list[str], bool]:
     verdict = (
         "Would be read as data, if it fits the environment." if is_known else f"Refused: {kind} is not known here."
     )
-    lines = [f"{escaped(str(path))}: a pickle of {kind}, {size:,} bytes", "Names in it that are not read here:"]
+    lines = [f"{escaped(str(path))}: a pickle of {kind}, {size:,} bytes", "Names in it that are not used here:"]
     return [*lines, *(f"  {name}" for name in foreign[:_SHOWN] or ["none"]), verdict], is_known

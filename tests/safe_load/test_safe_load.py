@@ -848,17 +848,17 @@ def test_a_folder_of_rl_zoo_opens(tmp_path, monkeypatch, capsys):
     assert enjoy.make_parser().parse_args(["x"]).trust is False
 
 
-# -------------------------------------------------------------------- code in fields that are not read, and inspection
+# -------------------------------------------------------------------- code in fields that are not used, and inspection
 
 
 def test_code_in_a_field_that_is_not_read_is_named(saved, tmp_path, marker):
     path = with_fields(saved, tmp_path / "x.zip", lr_schedule=serialized(Poison()), _last_obs=serialized(np.zeros(3)))
     with pytest.warns(
-        RuntimeWarning, match=r"The field 'lr_schedule' is not read here, but .* builtins\.exec$"
+        RuntimeWarning, match=r"The field 'lr_schedule' is not used here, but .* builtins\.exec$"
     ) as told:
         assert load_safely(path, device="cpu").num_timesteps > 0
     assert len([w for w in told if issubclass(w.category, RuntimeWarning)]) == 1
-    with pytest.warns(RuntimeWarning, match=r"The field 'lam' is not read here"):
+    with pytest.warns(RuntimeWarning, match=r"The field 'lam' is not used here"):
         load_safely(with_fields(saved, path, lam=serialized(Poison())), device="cpu", custom_objects={"lam": 0.5})
     assert not marker.exists()
 
@@ -903,7 +903,7 @@ def test_code_in_a_field_is_found_by_how_names_are_called(saved, tmp_path, marke
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", RuntimeWarning)
         load_safely(path, device="cpu")
-    assert any("'start_time' is not read here, but" in str(each.message) for each in told) == bool(found)
+    assert any("'start_time' is not used here, but" in str(each.message) for each in told) == bool(found)
     assert not marker.exists()
     with contextlib.suppress(Exception):  # the control: SB3 runs it
         TDC.load(path, device="cpu")
@@ -913,7 +913,7 @@ def test_code_in_a_field_is_found_by_how_names_are_called(saved, tmp_path, marke
 def test_code_in_statistics_is_found_by_how_names_are_called(tmp_path, capsys):
     (tmp_path / "stats.pkl").write_bytes(pickle.dumps(frames(), 2)[:-1] + code_of_known_names() + Op.POP + Op.STOP)
     _, out = inspected(tmp_path / "stats.pkl", capsys)
-    assert re.search(r"not read here:\n(  .*\n)*  builtins\.getattr\n(  .*\n)*  what another call returns\n", out)
+    assert re.search(r"not used here:\n(  .*\n)*  builtins\.getattr\n(  .*\n)*  what another call returns\n", out)
 
 
 def test_an_object_that_is_changed_twice_is_refused():
