@@ -90,12 +90,24 @@ class Store:
         self.open_again()
 
     def close(self) -> None:
-        """Release the lock, so that others can write to the folder until this store writes again."""
+        """
+        Release the lock, so that others can write to the folder until this store writes again.
+
+        A folder without any state is removed, with its lock file.
+        """
         if self._lock is not None:
             if self._owner == os.getpid():  # not in a forked process, which shares the lock
+                self._remove_empty()
                 unlock(self._lock)
             self._lock.close()
             self._lock = None
+
+    def _remove_empty(self) -> None:
+        if is_file_at(self._lock, self._lock_file) and not self.steps():
+            with suppress(OSError):  # it has files of others
+                (self.folder / _SHARED).rmdir()
+                self.folder.rmdir()
+                self._lock_file.unlink()
 
     def open_again(self, shared: Iterable[str] = ()) -> bool:
         """

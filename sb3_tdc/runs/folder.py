@@ -150,9 +150,29 @@ class RunFolder:
     @property
     def has_results(self) -> bool:
         """Return whether the run has results that would be overwritten if it began at step 0 again."""
-        logs = {self.path / "progress.csv": 1, **dict.fromkeys(self.path.glob("*monitor.csv"), 2)}  # lines of a header
-        has_rows = any(log.is_file() and log.read_bytes().count(b"\n") > header for log, header in logs.items())
+        headers = {log: 1 if log.name == "progress.csv" else 2 for log in self._logs()}  # lines
+        has_rows = any(log.read_bytes().count(b"\n") > header for log, header in headers.items())
         return has_rows or any(self.path.glob("*.zip")) or self.evaluations.is_file()
+
+    def _logs(self) -> list[Path]:
+        return [log for log in (*self.path.glob("*monitor.csv"), self.path / "progress.csv") if log.is_file()]
+
+    def take_logs(self) -> dict[Path, bytes]:
+        """Remove the logs of episodes and of training, and return their contents."""
+        logs = {path: path.read_bytes() for path in self._logs()}
+        for path in logs:
+            path.unlink()
+        return logs
+
+    def put_back(self, logs: dict[Path, bytes]) -> None:
+        """Replace the logs by those that were taken."""
+        self.take_logs()
+        for path, content in logs.items():
+            path.write_bytes(content)
+
+    def event_files(self) -> list[Path]:
+        """Return TensorBoard's files in the folder."""
+        return list(self.path.glob("events.out.tfevents.*"))
 
     @property
     def n_timesteps(self) -> int:

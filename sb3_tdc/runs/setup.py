@@ -140,12 +140,16 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     differing = {name: value for name, value in wanted.items() if name not in config or config[name] != value}
     if not settings.writes_states:
         raise ValueError(f"{folder.path} has no resume states: it was trained with --resume-freq -1")
+    if settings.start_over and settings.from_step is not None:
+        raise ValueError(f"--start-over begins at step 0, not at the state of --from {settings.from_step}: use one")
     has_state = bool(stored_steps(folder.resume_folder)) and not settings.start_over
     if folder.has_results and not has_state and not settings.start_over:
         raise ValueError(
             f"{folder.path} has results, but {folder.resume_folder} has no resume states: "
             "--start-over begins at step 0 again, and overwrites the results"
         )
+    if settings.from_step is not None and not has_state:
+        raise ValueError(f"{folder.resume_folder} has no state of step {settings.from_step:,}: leave out --from")
     _prepare(settings)
     hyperparams = parse(config, KNOWN_ALGORITHMS[settings.algo], where, differing, _COMMAND_LINE)
     set_random_seed(settings.seed)

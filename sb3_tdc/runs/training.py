@@ -132,20 +132,25 @@ def train(run: TrainingRun) -> TrainingOutcome:
     :raises NotSavedError: if the trained model cannot be written
     :raises LockedError: if another process has begun to write to the run folder
     """
-    with ended_processes(), ExitStack() as stack:
-        with _setting_up(run, stack):
+    with _removed_if_refused(run), ended_processes(), ExitStack() as stack:
+        with _setting_up(run.settings.verbose):
             if run.origin is not None:
                 check_saved_by(run.origin, run.settings.algo)
             states = _open_states(run)
             if states is not None:
                 stack.callback(states.store.close)
+            stack.enter_context(_logs_put_back_if_refused(run.folder))  # now that no other process writes to them
             model = _make_model(run, stack.enter_context(closing_envs(_make_training_envs(run))))
             stop = StopOnSignalCallback(states)
             callbacks = _make_callbacks(run, model, stop, states, stack)
-            if states is not None:
-                _select_state(run, states, model)
+            step = _select_state(run, states, model)
+            former = run.folder.event_files() if step is None else []
             model.set_logger(_make_logger(run))
             stack.callback(model.logger.close)
+            if run.is_resumed:  # last, since a refusal changes nothing
+                if step is None:
+                    _clear(run, states, former)
+                _record_changes(run, step)
         if run.settings.verbose > 0:
             _announce(run)
         if not run.has_state:
@@ -161,17 +166,34 @@ def train(run: TrainingRun) -> TrainingOutcome:
 
 
 @contextmanager
-def _setting_up(run: TrainingRun, stack: ExitStack) -> Iterator[None]:
-    """Raise ``SetupError`` if this block fails, after closing everything and removing the folder of a new run."""
+def _removed_if_refused(run: TrainingRun) -> Iterator[None]:
+    """Remove the folder of a new run that could not begin."""
+    try:
+        yield
+    except SetupError:
+        if not run.is_resumed:
+            run.folder.remove()
+        raise
+
+
+@contextmanager
+def _logs_put_back_if_refused(folder: RunFolder) -> Iterator[None]:
+    """Remove the logs, which environments and the logger open anew, and put them back if the run is not resumed."""
+    logs = folder.take_logs()
+    try:
+        yield
+    except (SetupError, NotRestoredError):
+        folder.put_back(logs)
+        raise
+
+
+@contextmanager
+def _setting_up(verbose: int) -> Iterator[None]:
+    """Raise ``SetupError`` if this block fails."""
     try:
         yield
     except BaseException as error:
-        stack.close()
-        if not run.is_resumed:
-            run.folder.remove()
-        if not isinstance(error, (Exception, KeyboardInterrupt)):
-            raise
-        if run.settings.verbose > 1:
+        if verbose > 1:
             traceback.print_exc()
         # Other errors come from the user's own wrappers, policies and callbacks: say where in the code
         is_a_sentence = isinstance(error, (*SETUP_ERRORS, KeyboardInterrupt))
@@ -220,7 +242,6 @@ def _learn(run: TrainingRun, model: OffPolicyAlgorithm, callbacks: list[BaseCall
         else:
             reason, details = describe_exception(error), ""
         if model.num_timesteps == 0 and not run.is_resumed:
-            run.folder.remove()
             raise SetupError(f"{run.settings.env} failed before the first step: {reason}") from error
         run.folder.write_error(details or traceback.format_exc())
         raise TrainingError(f"Training failed at step {model.num_timesteps:,}: {reason}") from error
@@ -245,44 +266,56 @@ def _open_states(run: TrainingRun) -> ResumeCallback | None:
     if not settings.writes_states:
         return None
     of_evaluations = [folder.best_model, folder.normalization(folder.best_model)]
-    states = ResumeCallback(
+    return ResumeCallback(
         folder.resume_folder,
         run.resume_freq,
         files=of_evaluations if settings.eval_freq > 0 else [],
         hyperparams=run.hyperparams.raw,
         verbose=settings.verbose,
     )
-    if settings.start_over:
-        states.store.clear()
-        folder.mark_unfinished()
-    # Stopped before its first step, or started over: training begins at step 0, so do the curves
-    if run.is_resumed and not states.store.steps():
-        for events in folder.path.glob("events.out.tfevents.*"):
-            events.unlink()
-    return states
 
 
-def _select_state(run: TrainingRun, states: ResumeCallback, model: OffPolicyAlgorithm) -> None:
+def _select_state(run: TrainingRun, states: ResumeCallback | None, model: OffPolicyAlgorithm) -> int | None:
     """
-    Select the state to resume from, and record the hyperparameters that change at its step.
+    Select the state to resume from.
 
+    :return: its step; None if training begins at step 0
     :raises ValueError: if there is no such state, or the new number of timesteps is not above its step
     """
-    folder, length = run.folder, run.hyperparams.n_timesteps
+    if states is None or not run.has_state:
+        return None
     # A hyperparameter that was ever changed takes its value from config.yml: the state may be older than the change
-    earlier = [name for change in folder.changes for name in change["hyperparams"] if name != "n_timesteps"]
-    step = states.select(model, run.settings.from_step, [*earlier, *run.changed]) or 0
-    changed = run.changed if step > 0 else ()  # at step 0, the new values hold for the whole run
-    if run.former_length is None:
-        if run.changed:
-            folder.record_change(step, run.hyperparams.raw, changed)
-        return
-    if length <= step:
+    earlier = [name for change in run.folder.changes for name in change["hyperparams"] if name != "n_timesteps"]
+    step = states.select(model, run.settings.from_step, [*earlier, *run.changed])
+    assert step is not None
+    length = run.hyperparams.n_timesteps
+    if run.former_length is not None and length <= step:
         raise ValueError(f"n_timesteps must be above {step:,}, the step of the resume state, got {length}")
-    # With a schedule, the steps so far differ from those of a run that had the new length from the start
-    is_another = step > 0 and bool(run.hyperparams.schedules)
-    folder.record_change(step, run.hyperparams.raw, (*changed, "n_timesteps") if is_another else changed)
-    folder.record_length(length)
+    return step
+
+
+def _clear(run: TrainingRun, states: ResumeCallback | None, former: list[Path]) -> None:
+    """Remove the states and the former event files of a run that begins at step 0 again."""
+    if states is not None:
+        states.store.clear()
+    run.folder.mark_unfinished()
+    for path in former:
+        path.unlink()
+
+
+def _record_changes(run: TrainingRun, step: int | None) -> None:
+    """
+    Record the hyperparameters that change when a run is resumed.
+
+    :param step: that of the resume state; None if training begins at step 0, and the new values hold for the whole run
+    """
+    names = run.changed
+    if run.former_length is not None:
+        # With a schedule, the steps so far differ from those of a run that had the new length from the start
+        names += ("n_timesteps",) if run.hyperparams.schedules else ()
+        run.folder.record_length(run.hyperparams.n_timesteps)
+    if run.changed or run.former_length is not None:
+        run.folder.record_change(step or 0, run.hyperparams.raw, names if step else ())
 
 
 # ---------------------------------------------------------------- environments

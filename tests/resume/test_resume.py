@@ -276,6 +276,38 @@ def test_a_run_is_resumed_by_the_arguments_that_began_it(tmp_path, monkeypatch, 
     assert "--gym-packages ['math'] contradicts" in fails(lambda: resume(run, "--env", "math:Pendulum-v1"), capsys)
 
 
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_what_is_refused_changes_nothing(stopped, capsys):
+    broken = ["n_envs:2", "callback:{stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes: {colour: red}}"]
+    before = contents(stopped)
+    for args, message in (
+        (["--from", "1"], "has no state of step 1; there are: 270, 269, "),
+        (["-n", "270"], "n_timesteps must be above 270"),
+        (["-params", "buffer_size:5"], "buffer_size cannot be changed when a run is resumed"),
+        (["--start-over", "--from", "269"], "--start-over begins at step 0, not at the state of --from 269: use one"),
+        (["--start-over", "-params", *broken], "unexpected keyword argument 'colour'"),
+    ):
+        assert message in fails(lambda args=args: resume(stopped, *args), capsys)
+        assert contents(stopped) == before, args
+    shutil.rmtree(stopped / "resume")
+    (stopped / "resume.lock").unlink()
+    RunFolder.open(stopped).mark_finished(270)
+    before = contents(stopped)
+    assert "'colour'" in fails(lambda: resume(stopped, "--start-over", "-params", *broken), capsys)
+    assert contents(stopped) == before
+    assert not (stopped / "resume").exists()
+
+
+def test_any_hyperparameter_may_change_when_a_run_starts_over(stopped):
+    (stopped / "1.monitor.csv").write_text("of a second environment\n")
+    assert resume(stopped, "--start-over", "-n", 120, "-params", "buffer_size:200") == 0
+    assert TDC.load(stopped / "Hopper-v4.zip", device="cpu").buffer_size == 200
+    assert not (stopped / "1.monitor.csv").exists()
+
+
 def test_the_same_arguments_are_no_contradiction(stopped, whole):
     assert resume(stopped, "--env", "Hopper-v4", "--seed", "1", "--verbose", "0") == 0
     assert outcome(stopped) == whole
