@@ -18,7 +18,6 @@ from sb3_tdc.common.playing import play_episodes
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.runs.trained import open_run
 
-FILE = "test_returns.npz"
 EPISODES = 100
 FIRST_SEED = 10_000  # seeds the environment in the first episode
 
@@ -48,7 +47,7 @@ def checksum(run: Run) -> str:
 
 def read_test_returns(run: Run) -> np.ndarray | None:
     """Return the stored test returns, (episodes,), or None if the current model has not been tested."""
-    path = run.folder.path / FILE
+    path = run.folder.test_returns
     if not path.is_file():
         return None
     try:
@@ -71,7 +70,7 @@ def measure_run(run: Run, episodes: int = EPISODES, packages: Sequence[str] = ()
     kept = read_test_returns(run)
     if kept is not None and len(kept) >= episodes:
         return kept[:episodes]
-    path = run.folder.path / FILE
+    path = run.folder.test_returns
     check_writable("Test returns:", path)
     before = checksum(run)
     trained = open_run(run.folder, run.folder.model, packages, trust)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.experiments import final_episodes as test_returns
+from sb3_tdc.experiments.final_episodes import read_test_returns
 from sb3_tdc.experiments.results import Run, check_same_run, flatten
 from sb3_tdc.runs.settings import RunSettings, flags_of
 
@@ -46,7 +46,8 @@ def publish(run: Run, logs: Path, folder: Path) -> Path:
     target = place / source.env_name
     target.mkdir(parents=True, exist_ok=True)
     _mirror(source.path / "evaluations.npz", place / "evaluations.npz")
-    _mirror(source.path / test_returns.FILE, place / test_returns.FILE, test_returns.read_test_returns(run) is not None)
+    of_the_model = read_test_returns(run) is not None
+    _mirror(source.test_returns, place / source.test_returns.name, of_the_model)
     for name in _SETTINGS:
         _mirror(source.path / source.env_name / name, target / name)
     if run.is_finished and source.steps_at_end is None:  # of RL Zoo, whose model, which is not copied, tells it

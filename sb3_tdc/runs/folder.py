@@ -114,6 +114,11 @@ class RunFolder:
         return self.path / "evaluations.npz"
 
     @property
+    def test_returns(self) -> Path:
+        """The returns of the final model in ``sb3-tdc evaluate``."""
+        return self.path / "test_returns.npz"
+
+    @property
     def trained_agent(self) -> Path:
         """The copy of the model that the run started from; a resumed run builds its networks from it."""
         return self.path / self.env_name / "trained_agent.zip"
@@ -170,9 +175,17 @@ class RunFolder:
         for path, content in logs.items():
             path.write_bytes(content)
 
-    def event_files(self) -> list[Path]:
-        """Return TensorBoard's files in the folder."""
-        return list(self.path.glob("events.out.tfevents.*"))
+    def results(self) -> list[Path]:
+        """Return the paths of everything that training leaves, except the logs that it opens anew (``take_logs``)."""
+        records = [self.evaluations, self.error, self._finished, self._changes]
+        events = self.path.glob("events.out.tfevents.*")
+        models = (self.model, self.best_model, *self.checkpoints().values())
+        return [*records, *events, *(path for model in models for path in self.files_of(model))]
+
+    def files_of(self, model: Path) -> list[Path]:
+        """Return the path of one of the run's models, and the paths of the files that belong to it."""
+        of_the_final_model = [self.test_returns] if model == self.model else []
+        return [model, self.normalization(model), self.replay_buffer(model), *of_the_final_model]
 
     @property
     def n_timesteps(self) -> int:
@@ -228,11 +241,6 @@ class RunFolder:
     def mark_finished(self, n_timesteps: int) -> None:
         """Record that training has ended and the model is saved."""
         _write_text(self._finished, plain_yaml.dump({"n_timesteps": n_timesteps}))
-
-    def mark_unfinished(self) -> None:
-        """Record that the run starts over, with its current hyperparameters."""
-        self._finished.unlink(missing_ok=True)
-        self._changes.unlink(missing_ok=True)
 
     def checkpoints(self) -> dict[int, Path]:
         """Return the models of ``--save-freq``, by timestep, oldest first."""

@@ -219,7 +219,7 @@ class RunSettings:
         default=False,
         role=Role.RESUMING,
         group=Group.SAVING,
-        help="with --resume: start again at step 0, and overwrite the results",
+        help="with --resume: start again at step 0, and remove the results",
     )
     tensorboard_log: str | None = setting(
         *("-tb", "--tensorboard-log"),

@@ -146,7 +146,7 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
     if folder.has_results and not has_state and not settings.start_over:
         raise ValueError(
             f"{folder.path} has results, but {folder.resume_folder} has no resume states: "
-            "--start-over begins at step 0 again, and overwrites the results"
+            "--start-over begins at step 0 again, and removes the results"
         )
     if settings.from_step is not None and not has_state:
         raise ValueError(f"{folder.resume_folder} has no state of step {settings.from_step:,}: leave out --from")

@@ -144,12 +144,14 @@ def train(run: TrainingRun) -> TrainingOutcome:
             stop = StopOnSignalCallback(states)
             callbacks = _make_callbacks(run, model, stop, states, stack)
             step = _select_state(run, states, model)
-            former = run.folder.event_files() if step is None else []
+            former = _former_results(run, step)
             model.set_logger(_make_logger(run))
             stack.callback(model.logger.close)
             if run.is_resumed:  # last, since a refusal changes nothing
-                if step is None:
-                    _clear(run, states, former)
+                if states is not None and step is None:
+                    states.store.clear()
+                for path in former:
+                    path.unlink(missing_ok=True)
                 _record_changes(run, step)
         if run.settings.verbose > 0:
             _announce(run)
@@ -294,13 +296,19 @@ def _select_state(run: TrainingRun, states: ResumeCallback | None, model: OffPol
     return step
 
 
-def _clear(run: TrainingRun, states: ResumeCallback | None, former: list[Path]) -> None:
-    """Remove the states and the former event files of a run that begins at step 0 again."""
-    if states is not None:
-        states.store.clear()
-    run.folder.mark_unfinished()
-    for path in former:
-        path.unlink()
+def _former_results(run: TrainingRun, step: int | None) -> list[Path]:
+    """
+    Return the paths of the results that training is about to repeat.
+
+    :param step: that of the resume state, which holds the evaluations and the best model; None if training begins at
+        step 0
+    """
+    folder = run.folder
+    if step is None:
+        return folder.results()
+    later = [model for steps, model in folder.checkpoints().items() if steps > step]
+    final = [folder.model] if run.settings.from_step is not None else []
+    return [path for model in (*later, *final) for path in folder.files_of(model)]
 
 
 def _record_changes(run: TrainingRun, step: int | None) -> None:

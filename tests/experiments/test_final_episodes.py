@@ -60,7 +60,7 @@ def test_a_model_with_a_class_of_the_user_is_tested_if_it_is_trusted(tmp_path, c
 
 def test_nothing_is_played_whose_returns_cannot_be_written(tmp_path, monkeypatch):
     run = make_run(tmp_path)
-    (run.path / final_episodes.FILE).mkdir()
+    run.test_returns.mkdir()
     monkeypatch.setattr(final_episodes, "open_run", lambda *args: pytest.fail("it was opened to be played"))
     with pytest.raises(ValueError, match=r"^Test returns: \S+ cannot be written: Is a directory$"):
         final_episodes.measure_run(Run.open(run.path))

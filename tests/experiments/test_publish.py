@@ -107,7 +107,7 @@ def test_a_place_that_cannot_be_written_is_said_at_once(logs, tmp_path, capsys):
 def test_a_run_without_test_episodes_is_named(logs, tmp_path, capsys):
     copy = tmp_path / "logs"
     shutil.copytree(logs, copy)
-    next(copy.rglob(final_episodes.FILE)).unlink()
+    next(copy.rglob("test_returns.npz")).unlink()
     assert publish.main([str(copy), "-o", str(tmp_path / "results")]) == 1
     assert "Without test episodes" in capsys.readouterr().out
 
@@ -152,10 +152,10 @@ def test_test_returns_of_another_model_do_not_stay(logs, tmp_path):
     copy, results = tmp_path / "logs", tmp_path / "results"
     shutil.copytree(logs, copy)
     publish.main([str(copy), "-o", str(results)])
-    assert len(list(results.rglob(final_episodes.FILE))) == 1
+    assert len(list(results.rglob("test_returns.npz"))) == 1
     with_fields(next(logs.rglob("Pendulum-v1.zip")), next(copy.rglob("Pendulum-v1.zip")), _n_updates=1_000_000)
     publish.main([str(copy), "-o", str(results)])
-    assert list(results.rglob(final_episodes.FILE)) == []
+    assert list(results.rglob("test_returns.npz")) == []
     assert len(list(results.rglob("evaluations.npz"))) == 1
 
 
@@ -220,7 +220,7 @@ def test_a_run_is_published_again_with_what_it_has_by_now(tmp_path):
     run = finish(make_run(tmp_path / "logs"))
     assert publish.main([str(tmp_path / "logs"), "-o", str(tmp_path / "results")]) == 1  # without test episodes
     checksum = final_episodes.checksum(Run.open(run.path))
-    np.savez(run.path / final_episodes.FILE, checksum=checksum, returns=[5.0, 6.0])
+    np.savez(run.test_returns, checksum=checksum, returns=[5.0, 6.0])
     assert publish.main([str(tmp_path / "logs"), "-o", str(tmp_path / "results")]) == 0
     assert final_episodes.read_test_returns(find_runs(tmp_path / "results")[0][0]).tolist() == [5, 6]
 

@@ -308,6 +308,43 @@ def test_any_hyperparameter_may_change_when_a_run_starts_over(stopped):
     assert not (stopped / "1.monitor.csv").exists()
 
 
+def test_nothing_of_the_former_training_stays_when_a_run_starts_over(tmp_path):
+    assert run_train(tmp_path, "--save-freq", 100, "--save-replay-buffer", small=[*SMALL, "normalize:true"], n=160) == 0
+    folder = tmp_path / "tdc" / "Hopper-v4_1"
+    run = RunFolder.open(folder)
+    run.write_error("of the former training")
+    run.test_returns.write_bytes(b"of the former model")
+    (folder / "notes.txt").write_text("mine")
+    assert resume(folder, "--start-over", "-n", 60) == 0  # too short for an evaluation and a saved model
+    logs = {"progress.csv", "0.monitor.csv", "events.out.tfevents"}
+    records = {"args.yml", "command.txt", "config.yml", "versions.yml", "finished.yml"}
+    models = {"Hopper-v4.zip", "replay_buffer.pkl", "vecnormalize.pkl"}
+    left = sorted(path.name for path in folder.rglob("*") if path.is_file())
+    assert [name.partition(".tfevents.")[0] + ".tfevents" if "tfevents" in name else name for name in left] == sorted(
+        {*logs, *records, *models, "notes.txt"}
+    )
+
+
+def test_models_of_later_steps_go_when_a_run_goes_back(tmp_path, stop_at, monkeypatch):
+    stop_at(270)
+    assert run_train(tmp_path, "--save-freq", 30) == 130
+    monkeypatch.undo()
+    run = RunFolder.open(tmp_path / "tdc" / "Hopper-v4_1")
+    run.test_returns.write_bytes(b"of the model of step 271")
+
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_learn", interrupted)
+    assert resume(run.path) == 130
+    assert list(run.checkpoints()) == [*range(30, 271, 30)]
+    assert run.model.exists()
+    assert resume(run.path, "--from", 40, "-params", "gamma:0.9") == 130
+    assert list(run.checkpoints()) == [30]
+    assert not run.model.exists()
+    assert not run.test_returns.exists()
+
+
 def test_the_same_arguments_are_no_contradiction(stopped, whole):
     assert resume(stopped, "--env", "Hopper-v4", "--seed", "1", "--verbose", "0") == 0
     assert outcome(stopped) == whole
