@@ -120,8 +120,44 @@ class RunFolder:
 
     @property
     def trained_agent(self) -> Path:
-        """The copy of the model that the run started from; a resumed run builds its networks from it."""
+        """The copy of the model that the run started from; a resumed run is built from it."""
         return self.path / self.env_name / "trained_agent.zip"
+
+    def copy_trained_agent(self, model: Path, normalization: Path | None, replay_buffer: Path) -> None:
+        """
+        Copy the model that the run starts from.
+
+        :param normalization: its statistics of ``VecNormalize``, if it has any
+        :param replay_buffer: its replay buffer, which may be missing; it is too large to be copied
+        """
+        shutil.copyfile(model, self.trained_agent)
+        if normalization is not None:
+            shutil.copyfile(normalization, self.normalization(self.trained_agent))
+        if replay_buffer.is_file():
+            written = {"path": str(replay_buffer.absolute()), "modified": replay_buffer.stat().st_mtime_ns}
+            _write_text(self._experience, plain_yaml.dump(written))
+
+    @property
+    def experience(self) -> Path | None:
+        """
+        The replay buffer of the model that the run started from; None if none was saved with it.
+
+        :raises ValueError: if the replay buffer is missing by now, or has been written again
+        """
+        if not self._experience.is_file():
+            return None
+        written = _read_yaml(self._experience)
+        path = Path(written["path"])
+        if not path.is_file() or path.stat().st_mtime_ns != written["modified"]:
+            raise ValueError(
+                f"{path}, the replay buffer that the run started from, is missing or has changed: "
+                f"put it back, or start a new run with -i {self.trained_agent}"
+            )
+        return path
+
+    @property
+    def _experience(self) -> Path:
+        return self.path / self.env_name / "trained_agent_replay_buffer.yml"
 
     @property
     def config(self) -> dict[str, Any]:
@@ -259,6 +295,8 @@ class RunFolder:
         """Return the path of the ``VecNormalize`` statistics of one of the run's models."""
         if model.name == self.best_model.name:
             return self.path / "best_model_vecnormalize.pkl"
+        if model.name == self.trained_agent.name:
+            return model.with_name("trained_agent_vecnormalize.pkl")
         if match := _CHECKPOINT.fullmatch(model.name):
             return self.path / f"rl_model_vecnormalize_{match[1]}_steps.pkl"
         return self.path / self.env_name / "vecnormalize.pkl"

@@ -1,7 +1,6 @@
 """The setup of a run from its settings: everything is checked before any file is written."""
 
 import shlex
-import shutil
 import textwrap
 from dataclasses import fields
 from os.path import abspath
@@ -86,19 +85,32 @@ def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
     """
     Make the run folder, with the settings, the hyperparameters and the model that the run starts from.
 
-    :raises ValueError: if it cannot be written; it is then removed
+    :raises ValueError: if a file of the model is missing, or the folder cannot be written; it is then removed
     """
-    folder = None
+    folder, origin = None, _find_origin(settings)
     try:
         folder = RunFolder.create(settings.log_folder, settings.algo, settings.env, settings.uuid)
         folder.write_config(hyperparams.raw, settings.as_plain())
-        if settings.trained_agent is not None:
-            shutil.copyfile(settings.trained_agent, folder.trained_agent)
+        if origin is not None:
+            folder.copy_trained_agent(*origin)
     except OSError as error:
         if folder is not None:
             folder.remove()
         raise ValueError(f"No run folder can be made in {settings.log_folder}: {error}") from error
     return folder
+
+
+def _find_origin(settings: RunSettings) -> tuple[Path, Path | None, Path] | None:
+    """
+    Return the model of ``-i``, its normalisation statistics, and the path of its replay buffer, which may not exist.
+
+    :raises ValueError: if the statistics are missing
+    """
+    if settings.trained_agent is None:
+        return None
+    model = Path(settings.trained_agent)
+    source = RunFolder.around(model, settings.env)
+    return model, source.find_normalization(model), source.replay_buffer(model)
 
 
 def _absolute(arguments: dict[str, Any]) -> dict[str, Any]:

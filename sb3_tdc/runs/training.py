@@ -80,9 +80,9 @@ class TrainingRun:
 
     @property
     def origin(self) -> Path | None:
-        """The zip whose model is trained further."""
+        """The zip whose model is trained further; that of a resumed run is a copy, since the original may be gone."""
         given = self.settings.trained_agent
-        return None if given is None else self.folder.trained_agent if self.has_state else Path(given)
+        return None if given is None else self.folder.trained_agent if self.is_resumed else Path(given)
 
     @property
     def log_interval(self) -> int | None:
@@ -369,8 +369,7 @@ def _make_model(run: TrainingRun, env: VecEnv) -> OffPolicyAlgorithm:
     if run.origin is None:
         return make_model(settings.algo, run.hyperparams, env, **arguments)
     model = continue_model(run.origin, settings.algo, run.hyperparams, env, settings.trust, **arguments)
-    experience = RunFolder.around(run.origin, settings.env).replay_buffer(run.origin)
-    if not run.has_state and experience.exists():
+    if not run.has_state and (experience := run.folder.experience) is not None:
         load_experience(model, experience, settings.trust)
     return model
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import configure
 from sb3_tdc.resume import ResumeCallback
 from sb3_tdc.resume.locations import Locations
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
-from tests.helpers.training import outcome, resume, run_train
+from tests.helpers.training import SMALL, fails, outcome, resume, run_train
 from tests.tools.runs import CASES, Stop, StopAt, run
 
 CASE = CASES["TD3"]
@@ -353,3 +353,33 @@ def test_a_run_that_started_from_a_model_continues_wherever_that_model_is_now(tm
     mine = tmp_path / "mine" / "tdc" / "Hopper-v4_1"
     assert resume(mine) == 0
     assert outcome(mine) == outcome(tmp_path / "whole" / "tdc" / "Hopper-v4_1")
+
+
+@pytest.mark.parametrize("place", ["gone", "another"])
+def test_a_run_that_started_from_a_model_starts_over_from_the_same(tmp_path, place):
+    normalized = [*SMALL, "normalize:true"]
+    assert run_train(tmp_path / "first", n=120, small=normalized) == 0
+    first, mine = tmp_path / "first" / "tdc" / "Hopper-v4_1", tmp_path / "mine" / "tdc" / "Hopper-v4_1"
+    assert run_train(tmp_path / "mine", "-i", first / "Hopper-v4.zip", n=160, small=normalized) == 0
+    before = outcome(mine)
+    shutil.rmtree(first)
+    if place == "another":
+        assert run_train(tmp_path / "first", n=110, small=normalized) == 0
+    assert resume(mine, "--start-over") == 0
+    assert outcome(mine) == before
+
+
+def test_a_run_does_not_start_over_without_the_replay_buffer_that_it_began_with(tmp_path, capsys):
+    assert run_train(tmp_path / "first", "--save-replay-buffer", n=120) == 0
+    first, mine = tmp_path / "first" / "tdc" / "Hopper-v4_1", tmp_path / "mine" / "tdc" / "Hopper-v4_1"
+    assert run_train(tmp_path / "mine", "-i", first / "Hopper-v4.zip", n=160) == 0
+    before = outcome(mine)
+    shutil.move(first, tmp_path / "moved")
+    missing = f"{first / 'replay_buffer.pkl'}, the replay buffer that the run started from, is missing or has changed"
+    assert missing in fails(lambda: resume(mine, "--start-over"), capsys)
+    first.mkdir()
+    (first / "replay_buffer.pkl").write_bytes((tmp_path / "moved" / "replay_buffer.pkl").read_bytes())
+    assert missing in fails(lambda: resume(mine, "--start-over"), capsys)
+    shutil.move(tmp_path / "moved" / "replay_buffer.pkl", first / "replay_buffer.pkl")
+    assert resume(mine, "--start-over") == 0
+    assert outcome(mine) == before
