@@ -49,7 +49,9 @@ _RUN_LIMITS: Limits = {
 }
 # Keyword arguments that belong to one run, not to an environment, and the flags of train.py that set them
 _FLAGS = {name: f"--{name.replace('_', '-')}" for name in ("env", "seed", "device", "verbose", "tensorboard_log")}
-_NO_HYPERPARAMETERS = {*_FLAGS, "self", "_init_setup_model"}
+OF_ONE_RUN = {*_FLAGS, "self", "_init_setup_model"}
+# Arguments of the algorithm that decide what its network is
+OF_THE_NETWORK = ("policy", "policy_kwargs", "stochastic_actor", "use_sde")
 # Arguments that the algorithm itself passes to the policy
 POLICY_ARGUMENTS = {"self", "observation_space", "action_space", "lr_schedule"}
 # Modules whose classes may be named without the module
@@ -182,7 +184,7 @@ def parse(
     """
     overrides = overrides or {}
     raw = merge(entry, overrides)
-    hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in _NO_HYPERPARAMETERS}
+    hints = {key: hint for key, hint in constructor_hints(algorithm).items() if key not in OF_ONE_RUN}
     hints.update(_RUN_KEYS)
     kept = {key: value for key, value in raw.items() if key not in overrides}
     for mapping, place_of in ((kept, where), (overrides, where_overrides)):

@@ -18,9 +18,10 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_tdc.common.checks import check_observation_space
 from sb3_tdc.common.files import write_atomically
 from sb3_tdc.common.noise import NormalNoiseRange, noise_of_all
+from sb3_tdc.common.signatures import constructor_parameters
 from sb3_tdc.common.words import count
 from sb3_tdc.envs.vector import GymnasiumVecEnv
-from sb3_tdc.hyperparams import Hyperparams
+from sb3_tdc.hyperparams import OF_ONE_RUN, OF_THE_NETWORK, Hyperparams
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.callbacks.finite_guard import check_before_saving
 from sb3_tdc.runs.folder import RunFolder
@@ -75,16 +76,39 @@ def continue_model(
     path: Path, algo: str, hyperparams: Hyperparams, env: VecEnv, trust: bool, **kwargs: Any
 ) -> OffPolicyAlgorithm:
     """
-    Load a model to train it further: the policy is the saved one, everything else comes from the hyperparameters.
+    Load a model to train it further: its network is the saved one, everything else comes from the hyperparameters.
 
     :param path: a zip
-    :raises ValueError: as :func:`load_model`, or if the replay buffer does not fit the environments
+    :raises ValueError: as :func:`load_model`, if the hyperparameters contain another network, or if the replay buffer
+        does not fit the environments
     """
     _check_hindsight(hyperparams, env)
-    of_the_saved_model = ("policy", "policy_kwargs")
-    arguments = {name: value for name, value in hyperparams.model.items() if name not in of_the_saved_model}
+    algorithm = KNOWN_ALGORITHMS[algo]
+    # The constructor derives some attributes from others, and gives those that are not named its default values
+    wanted = algorithm(env=None, **hyperparams.model, **_action_noise(hyperparams, env), _init_setup_model=False)
+    names = set(constructor_parameters(algorithm)) - {*OF_THE_NETWORK, *OF_ONE_RUN}
+    attributes = {key: vars(wanted)[key] for name in names for key in (name, f"_{name}") if key in vars(wanted)}
     with _enough_memory(hyperparams):
-        return load_model(path, algo, env, trust, **arguments, **_action_noise(hyperparams, env), **kwargs)
+        model = load_model(path, algo, env, trust, **attributes, **kwargs)
+    _check_network(model, wanted, hyperparams)
+    return model
+
+
+def _check_network(model: OffPolicyAlgorithm, wanted: OffPolicyAlgorithm, hyperparams: Hyperparams) -> None:
+    for name in (name for name in OF_THE_NETWORK if name in hyperparams.raw):
+        saved, given = (_part_of_network(each, name) for each in (model, wanted))
+        if saved != given:
+            raise ValueError(
+                f"{name} must be that of the saved model, or left out: {saved!r}, got {hyperparams.raw[name]!r}"
+            )
+
+
+def _part_of_network(model: OffPolicyAlgorithm, name: str) -> Any:
+    if name == "policy":
+        return model.policy_class
+    if name == "policy_kwargs":  # SB3 adds use_sde to them
+        return {key: value for key, value in model.policy_kwargs.items() if key not in OF_THE_NETWORK}
+    return getattr(model, name)
 
 
 def load_experience(model: OffPolicyAlgorithm, path: Path, trust: bool) -> None:

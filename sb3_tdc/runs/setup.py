@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_tdc.common import plain_yaml
 from sb3_tdc.common.threads import set_threads
 from sb3_tdc.envs.registry import require_env, split_env_id
-from sb3_tdc.hyperparams import Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
+from sb3_tdc.hyperparams import OF_THE_NETWORK, Hyperparams, convert_mapping, hyperparams_file, parse, read_entry
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
@@ -63,6 +63,8 @@ def read_hyperparams(settings: RunSettings) -> Hyperparams:
     """
     path = settings.conf_file or hyperparams_file(settings.algo)
     entry, name = read_entry(path, settings.env, settings.preset)
+    if settings.trained_agent is not None:
+        entry = {key: value for key, value in entry.items() if key not in OF_THE_NETWORK}
     n_timesteps = {"n_timesteps": settings.n_timesteps} if settings.n_timesteps > 0 else {}
     overrides = {**settings.hyperparams, **n_timesteps}
     where = f"{path}, {name}"

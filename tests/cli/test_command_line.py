@@ -164,6 +164,31 @@ def test_going_on_from_a_saved_model(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
+def test_a_model_keeps_its_network_alone_and_the_config_says_the_rest(tmp_path, capsys):
+    (tmp_path / "my.yml").write_text(
+        "default: {n_timesteps: 120, policy_kwargs: {net_arch: [8]}, learning_starts: 110}"
+    )
+    file, off = ["-conf", tmp_path / "my.yml", "--eval-freq", -1], {"env": "Pendulum-v1", "n": 120}
+    saved = ["-params", "policy_kwargs:{net_arch: [24], n_quantiles: 5}", "gradient_steps:8", "stats_window_size:7"]
+    assert run_train(tmp_path, *file, small=saved, **off) == 0
+    first, second = (tmp_path / "tdc" / f"Pendulum-v1_{i}" for i in (1, 2))
+    assert run_train(tmp_path, *file, "-i", first / "Pendulum-v1.zip", small=["-params", "n_steps:2"], **off) == 0
+    model = TDC.load(second / "Pendulum-v1.zip")
+    assert model.policy_kwargs == {"net_arch": [24], "n_quantiles": 5}
+    assert (model.n_steps, model.gradient_steps, model._stats_window_size) == (2, 1, 100)  # 1, 100: the constructor's
+    assert RunFolder.open(second).config == {"n_timesteps": 120, "learning_starts": 110, "n_steps": 2}
+    for other, message in (
+        (
+            "policy_kwargs:{net_arch: [32]}",
+            "policy_kwargs must be that of the saved model, or left out: {'net_arch': [24]",
+        ),
+        ("stochastic_actor:true", "stochastic_actor must be that of the saved model, or left out: False, got True"),
+    ):
+        with pytest.raises(SystemExit):
+            run_train(tmp_path, *file, "-i", first / "Pendulum-v1.zip", small=["-params", other], **off)
+        assert message in capsys.readouterr().err
+
+
 def test_normalisation_goes_on_in_an_environment_of_another_id(tmp_path, capsys):
     gym.register("Other-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=100)
     normalized = [*SMALL, "normalize:true"]

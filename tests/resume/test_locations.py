@@ -335,13 +335,15 @@ def test_names_that_look_like_files_of_the_run_stay_names(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("place", ["moved", "gone", "another"])
 def test_a_run_that_started_from_a_model_continues_wherever_that_model_is_now(tmp_path, place):
-    wide = ["-params", "policy_kwargs:{net_arch: [24], n_quantiles: 5}", "learning_starts:50", "batch_size:16"]
+    others = ["-params", "learning_starts:50", "batch_size:16"]
+    wide = [*others, "policy_kwargs:{net_arch: [24], n_quantiles: 5}"]
     assert run_train(tmp_path / "first", "--save-replay-buffer", n=120, small=wide) == 0
     first = tmp_path / "first" / "tdc" / "Hopper-v4_1"
-    assert run_train(tmp_path / "whole", "-i", first / "Hopper-v4.zip", n=300) == 0  # its networks are those of the zip
+    further = ["-i", first / "Hopper-v4.zip"]
+    assert run_train(tmp_path / "whole", *further, n=300, small=others) == 0  # its networks are those of the zip
     with pytest.MonkeyPatch.context() as patch:
         stop_with_sigterm(patch, 190)
-        assert run_train(tmp_path / "mine", "-i", first / "Hopper-v4.zip", n=300) == 130
+        assert run_train(tmp_path / "mine", *further, n=300, small=others) == 130
     if place == "another":
         assert run_train(tmp_path / "other", n=60) == 0
         shutil.rmtree(first)

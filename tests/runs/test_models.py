@@ -1,0 +1,58 @@
+"""Models that are trained further with the hyperparameters of another run."""
+
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_tdc.hyperparams import parse
+from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
+from sb3_tdc.runs.models import continue_model, make_model
+
+ARGUMENTS = (
+    *("learning_rate", "batch_size", "gamma", "train_freq", "gradient_steps", "n_steps"),
+    *("replay_buffer_class", "replay_buffer_kwargs", "policy_kwargs", "policy_class"),
+)
+
+
+@pytest.fixture
+def env():
+    env = make_vec_env("Pendulum-v1")
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("algo", ["tdc", "meow", "td3", "sac", "ddpg", "advb_sac"])
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_model_is_trained_further_with_the_arguments_of_a_new_one(tmp_path, env, algo, trust):
+    network = {"policy_kwargs": {"net_arch": [8, 8]}, "buffer_size": 100}
+    others = {"gradient_steps": 8, "train_freq": 4, "gamma": 0.5, "learning_rate": "lin_0.1"}
+    saved = make(algo, env, **network, **others, n_steps=3)
+    saved.save(tmp_path / "model.zip")
+    hyperparams = parse({"n_timesteps": 1, **network, "batch_size": 17}, KNOWN_ALGORITHMS[algo], "")
+    further = continue_model(tmp_path / "model.zip", algo, hyperparams, env, trust, device="cpu")
+    new = make(algo, env, **network, batch_size=17)
+    assert {name: getattr(further, name) for name in ARGUMENTS} == {name: getattr(new, name) for name in ARGUMENTS}
+    for name, weights in saved.policy.state_dict().items():
+        assert th.equal(further.policy.state_dict()[name], weights), name
+
+
+def make(algo, env, **arguments):
+    return make_model(algo, parse({"n_timesteps": 1, **arguments}, KNOWN_ALGORITHMS[algo], ""), env, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (
+            {"policy_kwargs": {"net_arch": [32]}},
+            r"policy_kwargs must be that of the saved model, .*: {'net_arch': \[8\]}",
+        ),
+        ({"policy": "CnnPolicy"}, "policy must be that of the saved model, or left out: "),
+        ({"use_sde": True}, "use_sde must be that of the saved model, or left out: False, got True"),
+    ],
+)
+def test_another_network_than_that_of_the_model_is_refused(tmp_path, env, other, message):
+    make("sac", env, policy_kwargs={"net_arch": [8]}, buffer_size=100).save(tmp_path / "model.zip")
+    hyperparams = parse({"n_timesteps": 1, "buffer_size": 100, **other}, KNOWN_ALGORITHMS["sac"], "")
+    with pytest.raises(ValueError, match=message):
+        continue_model(tmp_path / "model.zip", "sac", hyperparams, env, False, device="cpu")
