@@ -41,9 +41,10 @@ def make_envs(
     :param env_kwargs: keyword arguments of the environment's constructor; override those of the hyperparameters
     :param vec_env: "dummy" (one process), "subproc" (one process each), or "gymnasium" (``gymnasium.make_vec``)
     :param monitor_folder: folder of the files ``*.monitor.csv``
-    :param normalization: saved statistics for ``VecNormalize``
+    :param normalization: saved statistics for ``VecNormalize``; its options are those of the hyperparameters
     :param training: if False, the statistics do not change and rewards are not normalised
     :param trust: whether the saved statistics may run code, as in ``VecNormalize.load``
+    :raises ValueError: if the saved statistics are of other observations than those that are to be normalised
     """
     kwargs = {**hyperparams.env_kwargs, **(env_kwargs or {})}
     env = _make(_Wanted(env_id, hyperparams, seed, n_envs, kwargs, vec_env, monitor_folder))
@@ -52,13 +53,23 @@ def make_envs(
     if hyperparams.frame_stack is not None:  # inside VecNormalize, whose input the replay buffer stores
         env = VecFrameStack(env, hyperparams.frame_stack)
     if hyperparams.normalize is not None:
+        inner, env = env, VecNormalize(env, **hyperparams.normalize)
         if normalization is not None:
-            env = VecNormalize.load(str(normalization), env) if trust else load_normalization(normalization, env)
-        else:
-            env = VecNormalize(env, **hyperparams.normalize)
+            load = VecNormalize.load if trust else load_normalization
+            _take_statistics(env, load(str(normalization), inner), normalization)
         if not training:
             env.training, env.norm_reward = False, False
     return env
+
+
+def _take_statistics(env: VecNormalize, saved: VecNormalize, path: Path) -> None:
+    for name in ("norm_obs", "norm_obs_keys"):
+        now, then = getattr(env, name), getattr(saved, name)
+        if now != then:
+            raise ValueError(f"normalize: {name} must be {then!r}, as in {path}, got {now!r}")
+    env.ret_rms = saved.ret_rms
+    if env.norm_obs:
+        env.obs_rms = saved.obs_rms
 
 
 @dataclass(frozen=True)

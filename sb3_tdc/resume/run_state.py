@@ -225,9 +225,10 @@ def find_non_finite(model: OffPolicyAlgorithm) -> list[str]:
                 numbers |= {f"{name}[{i}].{moment}": value for moment, value in moments.items()}
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        statistics = {"ret_rms": normalization.ret_rms, "obs_rms": normalization.obs_rms}
-        if isinstance(normalization.obs_rms, dict):
-            statistics.update({f"obs_rms[{key!r}]": rms for key, rms in normalization.obs_rms.items()})
+        of_observations = vars(normalization).get("obs_rms")  # there is none if only rewards are normalised
+        statistics = {"ret_rms": normalization.ret_rms, "obs_rms": of_observations}
+        if isinstance(of_observations, dict):
+            statistics.update({f"obs_rms[{key!r}]": rms for key, rms in of_observations.items()})
         for name, rms in statistics.items():
             if isinstance(rms, RunningMeanStd):
                 numbers |= {f"VecNormalize.{name}.{part}": th.as_tensor(vars(rms)[part]) for part in ("mean", "var")}

@@ -165,6 +165,11 @@ class RunFolder:
         return _read_yaml(self._config)
 
     @property
+    def normalize(self) -> Any:
+        """The hyperparameter ``normalize`` as given; None if this is not the folder of a run."""
+        return self.config.get("normalize", False) if self._config.is_file() else None
+
+    @property
     def args(self) -> dict[str, Any]:
         """The command line arguments."""
         return _read_yaml(self.path / self.env_name / "args.yml")
@@ -310,7 +315,7 @@ class RunFolder:
         """
         # RL Zoo keeps one file for all models of a run
         found = next((path for path in map(self.normalization, (model, self.model)) if path.is_file()), None)
-        if found is None and self._config.is_file() and self.config.get("normalize"):
+        if found is None and self.normalize:
             missing = self.normalization(self.model)
             raise ValueError(f"{missing} is missing: {model.name} was trained on normalised observations")
         return found

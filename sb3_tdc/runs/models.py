@@ -83,7 +83,7 @@ def continue_model(
         does not fit the environments
     """
     _check_hindsight(hyperparams, env)
-    algorithm = KNOWN_ALGORITHMS[algo]
+    algorithm: Any = KNOWN_ALGORITHMS[algo]
     # The constructor derives some attributes from others, and gives those that are not named its default values
     wanted = algorithm(env=None, **hyperparams.model, **_action_noise(hyperparams, env), _init_setup_model=False)
     names = set(constructor_parameters(algorithm)) - {*OF_THE_NETWORK, *OF_ONE_RUN}

@@ -1,5 +1,6 @@
 """The setup of a run from its settings: everything is checked before any file is written."""
 
+import json
 import shlex
 import textwrap
 from dataclasses import fields
@@ -17,6 +18,7 @@ from sb3_tdc.hyperparams import OF_THE_NETWORK, Hyperparams, convert_mapping, hy
 from sb3_tdc.resume import stored_steps
 from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.folder import RunFolder
+from sb3_tdc.runs.models import check_saved_by
 from sb3_tdc.runs.settings import (
     MAX_RANDOM_SEED,
     Role,
@@ -89,7 +91,7 @@ def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
 
     :raises ValueError: if a file of the model is missing, or the folder cannot be written; it is then removed
     """
-    folder, origin = None, _find_origin(settings)
+    folder, origin = None, _find_origin(settings, hyperparams)
     try:
         folder = RunFolder.create(settings.log_folder, settings.algo, settings.env, settings.uuid)
         folder.write_config(hyperparams.raw, settings.as_plain())
@@ -102,17 +104,25 @@ def _make_folder(settings: RunSettings, hyperparams: Hyperparams) -> RunFolder:
     return folder
 
 
-def _find_origin(settings: RunSettings) -> tuple[Path, Path | None, Path] | None:
+def _find_origin(settings: RunSettings, hyperparams: Hyperparams) -> tuple[Path, Path | None, Path] | None:
     """
     Return the model of ``-i``, its normalisation statistics, and the path of its replay buffer, which may not exist.
 
-    :raises ValueError: if the statistics are missing
+    :raises ValueError: if another algorithm saved the model, if its statistics are missing, or if only the model or
+        only the run has normalisation
     """
     if settings.trained_agent is None:
         return None
     model = Path(settings.trained_agent)
+    check_saved_by(model, settings.algo)
     source = RunFolder.around(model, settings.env)
-    return model, source.find_normalization(model), source.replay_buffer(model)
+    statistics, wanted = source.find_normalization(model), hyperparams.normalize
+    if statistics is not None and wanted is None:
+        flag = shlex.quote(f"normalize:{json.dumps(source.normalize or True)}")
+        raise ValueError(f"{model} was trained with normalize: add -params {flag}")
+    if statistics is None and source.normalize is not None and wanted is not None and wanted.get("norm_obs", True):
+        raise ValueError(f"{model} was trained without normalize: add -params normalize:false")
+    return model, statistics, source.replay_buffer(model)
 
 
 def _absolute(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -152,6 +162,8 @@ def resume_run(given: dict[str, Any]) -> TrainingRun | None:
         return None
     wanted = {**given.get("hyperparams", {}), "n_timesteps": length}
     differing = {name: value for name, value in wanted.items() if name not in config or config[name] != value}
+    if settings.trained_agent is not None and "normalize" in differing:
+        raise ValueError(f"normalize cannot be changed: {folder.path} started from a model that it was chosen for (-i)")
     if not settings.writes_states:
         raise ValueError(f"{folder.path} has no resume states: it was trained with --resume-freq -1")
     if settings.start_over and settings.from_step is not None:

@@ -46,7 +46,7 @@ from sb3_tdc.runs.callbacks.progress import ProgressCallback
 from sb3_tdc.runs.callbacks.saving import SaveBestCallback, SavePeriodicallyCallback
 from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback
 from sb3_tdc.runs.folder import RunFolder
-from sb3_tdc.runs.models import DISK_ERRORS, check_saved_by, continue_model, load_experience, make_model, save_model
+from sb3_tdc.runs.models import DISK_ERRORS, continue_model, load_experience, make_model, save_model
 from sb3_tdc.runs.settings import RunSettings
 
 # Added to the run's seed for evaluations and for the board's test episodes: other initial states than in training
@@ -134,8 +134,6 @@ def train(run: TrainingRun) -> TrainingOutcome:
     """
     with _removed_if_refused(run), ended_processes(), ExitStack() as stack:
         with _setting_up(run.settings.verbose):
-            if run.origin is not None:
-                check_saved_by(run.origin, run.settings.algo)
             states = _open_states(run)
             if states is not None:
                 stack.callback(states.store.close)
@@ -333,8 +331,6 @@ def _make_training_envs(run: TrainingRun) -> VecEnv:
     normalization = None
     if run.origin is not None and not run.has_state:
         normalization = RunFolder.around(run.origin, run.settings.env).find_normalization(run.origin)
-        if normalization is not None and run.hyperparams.normalize is None:
-            raise ValueError(f"{run.origin} was trained on normalised observations: add -params normalize:true")
     settings = run.settings
     return make_envs(
         settings.env,

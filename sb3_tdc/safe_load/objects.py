@@ -39,7 +39,8 @@ def load_normalization(path: str | Path, env: VecEnv) -> VecNormalize:
             fresh = getattr(normalized, name, None)
             if not _same_layout(saved, fresh):
                 raise UnsafeFileError(f"its {name} are not those of {env.observation_space}")
-            setattr(normalized, name, saved)
+            if saved is not None:  # SB3 looks whether there are obs_rms
+                setattr(normalized, name, saved)
         return normalized
 
 

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import pickle
 import re
 import shlex
 import signal
@@ -150,7 +151,7 @@ def test_going_on_from_a_saved_model(tmp_path, capsys):
     assert after._n_updates == best._n_updates + 20
 
     for arguments, small, message in (
-        (["-i", first / "Hopper-v4.zip"], SMALL, "was trained on normalised observations: add -params normalize:true"),
+        (["-i", first / "Hopper-v4.zip"], SMALL, "was trained with normalize: add -params normalize:true"),
         (["-i", first / "Hopper-v4.zip"], [*normalized, "n_envs:2"], "it is of 1 environment, this run has 2"),
         (
             ["-i", first / "Hopper-v4.zip"],
@@ -196,11 +197,44 @@ def test_normalisation_goes_on_in_an_environment_of_another_id(tmp_path, capsys)
     first = tmp_path / "tdc" / "Pendulum-v1_1" / "Pendulum-v1.zip"
     with pytest.raises(SystemExit):
         run_train(tmp_path, "-i", first, env="Other-v0", n=130)
-    assert f"{first} was trained on normalised observations: add -params normalize:true" in capsys.readouterr().err
+    assert f"{first} was trained with normalize: add -params normalize:true" in capsys.readouterr().err
     assert run_train(tmp_path, "-i", first, env="Other-v0", n=130, small=normalized) == 0
     env = DummyVecEnv([lambda: gym.make("Other-v0")])
     saved = load_normalization(tmp_path / "tdc" / "Other-v0_1" / "Other-v0" / "vecnormalize.pkl", env)
     assert round(saved.obs_rms.count) == (1 + 120) + (1 + 130)  # the first observation, and one per step
+
+
+def train_further(tmp_path, model, *params):
+    """Train for 120 steps, with an evaluation; from a model unless it is None."""
+    further = [] if model is None else ["-i", model]
+    run_train(tmp_path, *further, "--eval-freq", 60, env="Pendulum-v1", n=120, small=[*SMALL, *params])
+    return max((tmp_path / "tdc").glob("Pendulum-v1_*")) / "Pendulum-v1.zip"
+
+
+def test_a_model_whose_observations_were_not_normalised_gets_none_that_are(tmp_path, capsys):
+    rewards = 'normalize:{"norm_obs": false}'
+    of_rewards = train_further(tmp_path / "rewards", None, rewards)
+    plain = train_further(tmp_path / "plain", None)
+    for model, params, message in (
+        (of_rewards, [], f"{of_rewards} was trained with normalize: add -params '{rewards}'"),
+        (of_rewards, ["normalize:true"], "normalize: norm_obs must be False, as in "),
+        (plain, ["normalize:true"], f"{plain} was trained without normalize: add -params normalize:false"),
+    ):
+        with pytest.raises(SystemExit):
+            train_further(tmp_path / "refused", model, *params)
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "refused").exists()
+    assert train_further(tmp_path / "further", of_rewards, rewards).is_file()
+    assert train_further(tmp_path / "too", plain, "normalize:{norm_obs: false, clip_reward: 3}").is_file()
+
+
+def test_only_the_statistics_of_normalisation_come_from_the_model(tmp_path):
+    first = train_further(tmp_path, None, "normalize:true")
+    further = train_further(tmp_path, first, "normalize:{norm_reward: false, clip_obs: 5}")
+    with open(further.parent / "Pendulum-v1" / "vecnormalize.pkl", "rb") as file:
+        saved = pickle.load(file)
+    assert (saved.norm_reward, saved.clip_obs, saved.clip_reward) == (False, 5, 10)  # 10 is VecNormalize's default
+    assert round(saved.obs_rms.count) == 2 * (1 + 120)  # the first observation, and one per step
 
 
 @pytest.mark.parametrize("small", [SMALL, [*SMALL, "normalize:true"]])
