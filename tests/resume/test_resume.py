@@ -36,6 +36,7 @@ from sb3_tdc.runs.callbacks import busy_machine
 from sb3_tdc.runs.callbacks import stopping as interruption
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
 from sb3_tdc.runs.folder import RunFolder
+from tests.helpers.command_line import SMALL_ANY, run_enjoy
 from tests.helpers.training import SMALL, fails, outcome, resume, run_train
 from tests.tools import kill
 from tests.tools.runs import Stop, StopAt
@@ -204,6 +205,16 @@ def test_a_registered_function_need_not_be_sent_from_its_process(tmp_path, recwa
     with np.load(tmp_path / "tdc" / "OfAFunction-v0_1" / "evaluations.npz") as evaluations:
         assert (evaluations["ep_lengths"] == 50).all()
     assert not [warned for warned in recwarn if "OfAFunction" in str(warned.message) or "spec" in str(warned.message)]
+
+
+def test_a_run_that_normalizes_only_rewards_is_trained_resumed_and_played(tmp_path, stop_at, monkeypatch):
+    """VecNormalize has no statistics of observations then."""
+    of_td3 = [*SMALL_ANY, "normalize:{norm_obs: false}"]
+    stop_at(130)
+    assert run_train(tmp_path, "--algo", "td3", "-tb", "", env="Pendulum-v1", n=150, small=of_td3) == 130
+    monkeypatch.undo()
+    assert resume(tmp_path / "td3" / "Pendulum-v1_1") == 0
+    assert run_enjoy("--algo", "td3", "--env", "Pendulum-v1", "-f", tmp_path) == 0
 
 
 def test_starting_over_needs_consent(stopped, whole, capsys):
