@@ -2,7 +2,9 @@
 
 import os
 import re
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +82,8 @@ def lock(path: Path) -> Any:
     """
     Lock a file until it is closed; create it if it does not exist. On Windows the file is opened, but not locked.
 
+    Nothing is locked on Windows, or by a file system without locks, of which a warning tells.
+
     :return: the open file; None if another process has locked it
     """
     file = path.open("a")
@@ -89,9 +93,16 @@ def lock(path: Path) -> Any:
         return file
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         file.close()
         return None
+    except OSError as error:
+        # Without a path: a matrix locks many files, and the same sentence is shown once
+        warnings.warn(
+            f"The file system cannot lock files ({error.strerror}): train each run in one process at a time",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     if not is_file_at(file, path):  # removed by a process that has just finished
         file.close()
         return lock(path)
@@ -104,7 +115,8 @@ def unlock(file: Any) -> None:
         import fcntl
     except ImportError:  # Windows
         return
-    fcntl.flock(file, fcntl.LOCK_UN)
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(file, fcntl.LOCK_UN)
 
 
 def is_file_at(file: Any, path: Path) -> bool:

@@ -1,6 +1,7 @@
 """The states of ``ResumeCallback`` on disk: each is there whole or not at all, and damaged ones are passed over."""
 
 import errno
+import fcntl
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import warnings
 
 import pytest
 
+from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.resume.store import BrokenStateError, LockedError, Store
 from tests.helpers.paths import ROOT
 
@@ -144,6 +146,24 @@ def test_one_process_at_a_time(store):
     assert sentence in open_elsewhere().stderr
     store.close()
     assert open_elsewhere().returncode == 0
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_named_and_can_be_written_to(tmp_path, monkeypatch, number):
+    def flock(*args):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.warns(RuntimeWarning, match=rf"cannot lock files \({os.strerror(number)}\): train each run in one"):
+        store = Store(tmp_path / "resume", keep=2, span=0)
+    write(store, 1)
+    assert store.newest().step == 1
+    store.remove_all()
+    job = Job("tdc", "Pendulum-v1", 1, 100, tmp_path)
+    job.log.parent.mkdir()
+    job.log.touch()
+    with pytest.warns(RuntimeWarning, match="cannot lock files"):
+        assert not job.is_trained_elsewhere
 
 
 def test_in_one_process_the_newest_has_the_folder(store):
