@@ -13,6 +13,7 @@ from unittest import mock
 
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
+from sb3_tdc.common.files import make_numbered
 from sb3_tdc.resume.locations import Locations
 
 
@@ -35,33 +36,51 @@ def restore_event_files(
     Remove the events that this process has written so far, and those written after the state was captured.
 
     The files stay in their folder. If this folder is outside the run's folder and the run is a copy, the folder belongs
-    to the original run. The copy then continues with copies of the files, in the folder made for this process.
+    to the original run. The copy then continues with copies of the files, in a folder of its own.
 
     :param step: the timestep of the state; a TensorBoard that is watching discards the events that it has seen after it
     """
     from torch.utils.tensorboard.writer import SummaryWriter
 
+    opened = Path(output.writer.log_dir)
+    # Not every file in the folder: SB3 opens the latest one, of any run, if ``reset_num_timesteps`` is False
+    written = Path(output.writer.file_writer.event_writer._file_name)
     output.writer.close()
-    opened, folder = Path(output.writer.log_dir), Path(state["folder"])
-    if not folder.is_dir():
-        folder = opened
-    if not folder.samefile(opened):  # the opened folder was made for this process
-        for path in _event_files(opened):
-            path.unlink()
-        if locations.is_copy and not locations.contains(folder):
-            for name in state["sizes"]:
-                shutil.copy2(folder / name, opened / name)
-            folder = opened
-        else:
-            with suppress(OSError):
-                opened.rmdir()
+    written.unlink(missing_ok=True)
+    folder = _find_folder(opened, state, locations)
     for path in _event_files(folder):
         if path.name not in state["sizes"]:
             path.unlink()
         elif path.stat().st_size > state["sizes"][path.name]:
             os.truncate(path, state["sizes"][path.name])
+    if folder != opened:
+        with suppress(OSError):  # not empty: it was not made for this process
+            opened.rmdir()
     with _named_after(state["sizes"]):
         output.writer = SummaryWriter(str(folder), purge_step=step + 1)
+
+
+def _find_folder(opened: Path, state: dict[str, Any], locations: Locations) -> Path:
+    """
+    Return the folder in which the run's events continue: that of the captured files, or one without other files.
+
+    :param opened: the folder that this process has opened, which may be of another run
+    """
+    captured = Path(state["folder"])
+    is_of_original = locations.is_copy and not locations.contains(captured)
+    if _holds_any(captured, state["sizes"]) and not is_of_original:
+        return captured
+    is_captured = os.path.realpath(opened) == os.path.realpath(captured)
+    if _event_files(opened) and (is_captured or not _holds_any(opened, state["sizes"])):
+        opened = make_numbered(opened.parent, re.sub(r"_\d+$", "", opened.name))
+    for path in _event_files(captured):
+        if path.name in state["sizes"]:
+            shutil.copy2(path, opened)
+    return opened
+
+
+def _holds_any(folder: Path, names: Iterable[str]) -> bool:
+    return any((folder / name).is_file() for name in names)
 
 
 @contextmanager

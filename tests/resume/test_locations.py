@@ -8,7 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import pandas as pd
 import pytest
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -112,6 +112,50 @@ def test_a_copy_of_a_run_with_a_tensorboard_folder_outside_leaves_that_of_the_or
     assert events_in(boards / "TDC_1") == events_in(boards / "TDC_2")
     assert outcome_without_events(tmp_path / "copy") == outcome_without_events(mine)
     assert snapshot(tmp_path / "elsewhere") == {}
+
+
+def learn_with_board(run_folder, board, steps=80, stop_at=None, **kwargs):
+    """Train with SB3's ``tensorboard_log``, which opens the latest folder if ``reset_num_timesteps`` is False."""
+    small = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 200, "learning_starts": 500, "device": "cpu"}
+    model = TD3("MlpPolicy", "Pendulum-v1", seed=1, tensorboard_log=str(board), **small)
+    states = ResumeCallback(run_folder / "resume", freq=20, verbose=0)
+    states.select(model)
+    try:
+        model.learn(steps, callback=[states, StopAt(stop_at)], **kwargs)
+    except Stop:
+        pass
+    finally:
+        states.store.close()
+        model.logger.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "resumed", "continued"),
+    [
+        ("nothing", "mine", "TD3_1"),
+        ("copy", "copy", "TD3_3"),
+        ("copy, latest", "copy", "TD3_2"),
+        ("lost", "mine", "TD3_3"),
+    ],
+)
+def test_events_of_another_run_stay_whichever_folder_is_opened(tmp_path, change, resumed, continued):
+    board = tmp_path / "board"
+    learn_with_board(tmp_path / "mine", board, stop_at=50)
+    if change != "copy, latest":
+        learn_with_board(tmp_path / "other", board)
+    if change.startswith("copy"):
+        shutil.copytree(tmp_path / "mine", tmp_path / "copy")
+    elif change == "lost":
+        shutil.rmtree(board / "TD3_1")
+    before = snapshot(board)
+    learn_with_board(tmp_path / resumed, board, reset_num_timesteps=False)
+    others = {path: file for path, file in before.items() if path.parent.name != continued}
+    assert others
+    assert others.items() <= snapshot(board).items()
+    kept = [] if change == "lost" else [path.name for path in before if path.parent.name == "TD3_1"]
+    names = [path.name for path in sorted((board / continued).iterdir())]
+    assert (names[:-1], len(names)) == (kept, len(kept) + 1)
+    assert len(list(board.iterdir())) == len({path.parent for path in before} | {Path(continued)})
 
 
 def stop_with_sigterm(patch, step):
