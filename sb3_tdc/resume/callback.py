@@ -130,7 +130,11 @@ class ResumeCallback(BaseCallback):
         self.store.open_again()  # refuses a folder locked by another, before any file is removed or restored
         if self._to_restore is None:
             newest = max(self.store.steps(), default=None)
-            if newest is not None and newest != self.last_step:
+            if newest is None:
+                self.last_step = self.last_try = None
+                self._forget_files()
+            # After an earlier ``learn`` with this callback, the run continues, unless it counts from step 0 again
+            elif newest != self.last_step or self.locals["reset_num_timesteps"]:
                 raise ValueError(
                     f"{self.store.folder} has states of a run already: call select(model) to resume from one, "
                     "or choose another folder"
@@ -252,7 +256,7 @@ class ResumeCallback(BaseCallback):
         parts, context = run_state.capture_state(model, self.root, self._initial)
         self._tell(context.left_out)
         if not self.store.open_again(self._digests):
-            self._segments, self._digests, self._before, self._kept = [], {}, None, {}
+            self._forget_files()
         segments, digests = self._write_segment(step, refusal)
         files = [*self.files, *run_state.files_of_evaluations(self.root)]
         content = {
@@ -278,6 +282,10 @@ class ResumeCallback(BaseCallback):
         self._before = model.replay_buffer.pos, step
         self._kept = {file: (stats[file], stored.path / f"file_{i}") for i, file in enumerate(files) if file in stats}
         self.store.remove_old()
+
+    def _forget_files(self) -> None:
+        """Forget the files of earlier states, so that the next state does not need them."""
+        self._segments, self._digests, self._before, self._kept = [], {}, None, {}
 
     def _write_segment(self, step: int, refusal: str) -> tuple[list[replay_file.Segment], dict[str, str]]:
         model: Any = self.model

@@ -452,6 +452,30 @@ def test_a_state_of_another_run_is_refused(tmp_path):
     states.store.close()
 
 
+@pytest.mark.parametrize("freq", [20, 10_000])
+def test_a_callback_does_not_mix_the_states_of_two_runs(tmp_path, freq):
+    """As when the cell of a notebook that calls ``learn`` is run again: SB3 counts from 0, with the trained model."""
+    model, states = make_model(), ResumeCallback(tmp_path / "resume", freq=freq, verbose=0)
+    model.learn(50, callback=states)
+    steps = [40, 20, 0] if freq == 20 else [0]
+    assert states.store.steps() == steps
+    with pytest.raises(ValueError, match="has states of a run already: call select"):
+        model.learn(50, callback=states)
+    assert states.store.steps() == steps
+    model.num_timesteps = 50  # before the refused call
+    model.learn(40, callback=states, reset_num_timesteps=False)
+    assert max(states.store.steps()) == (80 if freq == 20 else 0)
+    shutil.rmtree(tmp_path / "resume")
+    model.learn(50, callback=states)
+    assert states.store.steps() == steps
+    states.store.close()
+    resumed, states = make_model(), ResumeCallback(tmp_path / "resume", verbose=0)
+    assert states.select(resumed) == max(steps)
+    resumed.learn(50, callback=states)
+    states.store.close()
+    np.testing.assert_array_equal(resumed.replay_buffer.observations, model.replay_buffer.observations)
+
+
 def test_an_older_callback_removes_nothing_of_a_newer_one(tmp_path):
     learn(make_model(), tmp_path, stop_at=70)
     steps = stored_steps(tmp_path)
