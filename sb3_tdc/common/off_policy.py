@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -201,6 +201,13 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
 
     def forget_episodes(self) -> None:
         """Forget what a subclass has recorded of the current episodes, because the environments begin new ones."""
+
+    def prepare_to_restore(self, names: Collection[str]) -> None:
+        """
+        Build the parts that a run has built anew after its beginning, before their weights are restored.
+
+        :param names: names of the state dicts and tensors in the state
+        """
 
     def prepare_to_continue(self) -> None:
         """Create what a model otherwise creates in its first updates, for a run that is resumed after them."""

@@ -23,6 +23,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_tdc.common.finite import find_non_finite_weights
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.versions import library_versions
+from sb3_tdc.common.words import listed
 from sb3_tdc.resume.compare import differences
 from sb3_tdc.resume.kinds.table import KINDS
 from sb3_tdc.resume.locations import UNMOVED, Locations
@@ -203,7 +204,19 @@ def capture_weights(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def restore_weights(model: OffPolicyAlgorithm, weights: dict[str, Any]) -> None:
-    """Restore weights in place, so that optimizers and targets still refer to the same parameters."""
+    """
+    Restore weights in place, so that optimizers and targets still refer to the same parameters.
+
+    :raises NotRestoredError: if the model has other optimizers and tensors than the state
+    """
+    then = {*weights["state_dicts"], *weights["tensors"]}
+    if isinstance(model, CheckedOffPolicyAlgorithm):
+        model.prepare_to_restore(then)
+    now = {name for names in model._get_torch_save_params() for name in names}
+    if now != then:
+        raise NotRestoredError(
+            f"The state has the weights of {listed(sorted(then))}, and the model has those of {listed(sorted(now))}"
+        )
     for name, state in weights["state_dicts"].items():
         recursive_getattr(model, name).load_state_dict(state)
     with th.no_grad():

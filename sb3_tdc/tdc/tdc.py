@@ -3,7 +3,7 @@
 import io
 import math
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -131,6 +131,8 @@ class TDC(FusedUpdateAlgorithm):
     changeable: ClassVar[tuple[str, ...]] = (
         *("lam", "kappa", "qf_learning_rate", "policy_delay", "target_policy_noise", "target_noise_clip"),
     )
+    # Without it, a temperature that was replaced and then learned would be replaced again
+    captured_attributes: ClassVar[tuple[str, ...]] = (*FusedUpdateAlgorithm.captured_attributes, "_built_ent_coef")
     color: ClassVar[str | None] = "#0072B2"
     policy: TDCPolicy
     replay_buffer: ReplayBuffer
@@ -285,6 +287,12 @@ class TDC(FusedUpdateAlgorithm):
     def _renew_temperature(self) -> None:
         """Build the temperature again if ``ent_coef`` has changed since it was built."""
         if self.ent_coef != self._built_ent_coef:
+            self._setup_temperature()
+
+    def prepare_to_restore(self, names: Collection[str]) -> None:
+        is_learned = "ent_coef_optimizer" in names
+        if self.stochastic_actor and is_learned != self._learns_ent_coef:
+            self.ent_coef = "auto" if is_learned else 0.0  # the state's own value is restored after the weights
             self._setup_temperature()
 
     # ---------------------------------------------------------------- Algorithm 1

@@ -1,5 +1,6 @@
 """``train.py --resume`` and ``ResumeCallback``: what a user sees when a run is stopped, damaged, or changed."""
 
+import contextlib
 import errno
 import functools
 import hashlib
@@ -23,13 +24,14 @@ import torch as th
 import yaml
 from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_tdc import TDC
 from sb3_tdc.cli import train
 from sb3_tdc.common import plain_yaml
-from sb3_tdc.resume import LockedError, Restorable, ResumeCallback, callback, stored_steps
+from sb3_tdc.resume import LockedError, NotRestoredError, Restorable, ResumeCallback, callback, stored_steps
 from sb3_tdc.resume import run_state as state
 from sb3_tdc.runs import training
 from sb3_tdc.runs.callbacks import busy_machine
@@ -487,6 +489,55 @@ def test_an_older_callback_removes_nothing_of_a_newer_one(tmp_path):
         model.learn(150, callback=older)
     assert stored_steps(tmp_path) == steps
     newer.store.close()
+
+
+class Replaces(BaseCallback):
+    """Replaces ``ent_coef`` during a run."""
+
+    def __init__(self, ent_coef, step):
+        super().__init__()
+        self.ent_coef, self.step = ent_coef, step
+
+    def _on_step(self):
+        if self.num_timesteps == self.step:
+            self.model.ent_coef = self.ent_coef
+        return True
+
+
+def learn_and_replace(folder, built, replaced, at, stop_at=None):
+    model = make_model(stochastic_actor=True, ent_coef=built, learning_starts=40)
+    states = ResumeCallback(folder, freq=20, verbose=0)
+    states.select(model)
+    with contextlib.suppress(Stop):
+        model.learn(90, callback=[states, Replaces(replaced, at), StopAt(stop_at)])
+    states.store.close()
+    return model
+
+
+@pytest.mark.parametrize(
+    ("built", "replaced", "at", "stop_at"),
+    [
+        ("auto", 0.1, 30, 55),  # the state of step 40, before the first update, which builds the new temperature
+        ("auto", 0.1, 50, 75),
+        (0.1, "auto", 50, 75),
+        ("auto", "auto_0.1", 50, 75),
+    ],
+)
+def test_a_replaced_temperature_is_that_of_the_resumed_run(tmp_path, built, replaced, at, stop_at):
+    whole = learn_and_replace(tmp_path / "whole", built, replaced, at)
+    learn_and_replace(tmp_path / "stopped", built, replaced, at, stop_at)
+    resumed = learn_and_replace(tmp_path / "stopped", built, replaced, at)
+    assert resumed.ent_coef == whole.ent_coef == replaced
+    assert resumed.current_ent_coef().equal(whole.current_ent_coef())
+    weights = whole.policy.state_dict()
+    assert all(weight.equal(weights[name]) for name, weight in resumed.policy.state_dict().items())
+
+
+def test_a_state_with_other_optimizers_is_refused(tmp_path):
+    """Only TDC builds the temperature of a state: SAC reads ``ent_coef`` once, when it is made."""
+    learn(make_model(algorithm=SAC), tmp_path, stop_at=70)
+    with pytest.raises(NotRestoredError, match=r"has the weights of .*, ent_coef_optimizer, .* ent_coef_tensor"):
+        learn(make_model(algorithm=SAC, ent_coef=0.1), tmp_path)
 
 
 def test_other_callbacks_are_noticed(tmp_path):
