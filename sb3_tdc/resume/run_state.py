@@ -109,10 +109,14 @@ def _restore_values(
     for owner, path in ((model, "model"), (_buffer(model), "replay_buffer")):
         nodes = {name: node for name, node in parts[path].items() if name not in kept}
         context.restore_attributes(nodes, owner, path, optional=True)
+    normalization = model.get_vec_normalize_env()
+    built_gamma = None if normalization is None else normalization.gamma
     for node, value, path in ((parts["env"], model.env, "env"), (parts["callbacks"], callback, "callbacks")):
         if node is not None:
             with context.optional(path):
                 context.restore(node, value, path)
+    if normalization is not None and "gamma" in changed:
+        normalization.gamma = built_gamma
     logger = SimpleNamespace(**_logger_attributes(model))
     with context.names():
         context.restore_attributes(parts["logger"], logger, "logger", optional=True)

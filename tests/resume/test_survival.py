@@ -19,11 +19,14 @@ import numpy as np
 import pytest
 import yaml
 from gymnasium.envs.classic_control import PendulumEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tdc import TDC
 from sb3_tdc.resume import ResumeCallback, stored_steps
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
 from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback, StoppableEvaluation
+from sb3_tdc.safe_load import load_normalization
+from tests.helpers.command_line import SMALL_ANY
 from tests.helpers.paths import ROOT
 from tests.helpers.training import fails, outcome, resume, run_train
 
@@ -282,6 +285,20 @@ def test_an_edited_config_is_named_and_can_be_changed_openly(stopped, capsys):
     assert resume(stopped, "-params", "gamma:0.9") == 0
     assert TDC.load(stopped / "Hopper-v4.zip", device="cpu").gamma == 0.9
     assert yaml.safe_load(path.read_text())["gamma"] == 0.9
+
+
+@pytest.mark.parametrize(("normalize", "expected"), [("true", 0.9), ("{gamma: 0.95}", 0.95)])
+def test_a_changed_gamma_is_that_of_normalized_rewards_unless_they_have_their_own(
+    tmp_path, stop_at, monkeypatch, normalize, expected
+):
+    of_td3 = [*SMALL_ANY, f"normalize:{normalize}"]
+    stop_at(130)
+    assert run_train(tmp_path, "--algo", "td3", "-tb", "", env="Pendulum-v1", n=150, small=of_td3) == 130
+    monkeypatch.undo()
+    folder = tmp_path / "td3" / "Pendulum-v1_1"
+    assert resume(folder, "-params", "gamma:0.9") == 0
+    env = DummyVecEnv([lambda: gym.make("Pendulum-v1")])
+    assert load_normalization(folder / "Pendulum-v1" / "vecnormalize.pkl", env).gamma == expected
 
 
 def test_a_run_with_changed_hyperparameters_is_resumed_again(stopped, monkeypatch):
