@@ -1,5 +1,6 @@
 """Helpers for files that are never half written, and for folders that no two processes share."""
 
+import errno
 import os
 import re
 import warnings
@@ -13,15 +14,34 @@ def write_atomically(write: Callable[[Path], Any], path: Path) -> None:
     """
     Write a file next to its final path, then rename it: an existing file stays whole until the new one is complete.
 
+    The new file is on disk when this returns: a power cut does not lose it.
+
     :param write: function that writes the file to the path that it is given, which has the same suffix
     :param path: the final path
     """
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         write(part)
+        sync(part)
         os.replace(part, path)
+        sync(path.parent)
     finally:
         part.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until the content of a file, or the names of the files in a folder, are on disk."""
+    is_windows = os.name == "nt"
+    if is_windows and path.is_dir():  # it cannot be opened
+        return
+    descriptor = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)  # Windows syncs only what may be written
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a file system that cannot sync folders
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def check_writable(flag: str, path: Path) -> None:

@@ -13,7 +13,7 @@ from unittest import mock
 
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-from sb3_tdc.common.files import make_numbered
+from sb3_tdc.common.files import make_numbered, sync
 from sb3_tdc.resume.locations import Locations
 
 
@@ -23,8 +23,7 @@ def capture_event_files(output: TensorBoardOutputFormat) -> dict[str, Any]:
     folder = Path(output.writer.log_dir)
     sizes = {}
     for path in _event_files(folder):
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
+        sync(path)
         sizes[path.name] = path.stat().st_size
     return {"folder": os.path.abspath(folder), "sizes": sizes}
 
@@ -44,7 +43,7 @@ def restore_event_files(
 
     opened = Path(output.writer.log_dir)
     # Not every file in the folder: SB3 opens the latest one, of any run, if ``reset_num_timesteps`` is False
-    written = Path(output.writer.file_writer.event_writer._file_name)
+    written = Path(output.writer.file_writer.event_writer._file_name)  # type: ignore[attr-defined]  # untyped
     output.writer.close()
     written.unlink(missing_ok=True)
     folder = _find_folder(opened, state, locations)

@@ -110,7 +110,7 @@ def _restore_values(
         nodes = {name: node for name, node in parts[path].items() if name not in kept}
         context.restore_attributes(nodes, owner, path, optional=True)
     normalization = model.get_vec_normalize_env()
-    built_gamma = None if normalization is None else normalization.gamma
+    built_gamma = normalization.gamma if normalization is not None else model.gamma
     for node, value, path in ((parts["env"], model.env, "env"), (parts["callbacks"], callback, "callbacks")):
         if node is not None:
             with context.optional(path):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
-from sb3_tdc.common.files import is_file_at, lock, unlock
+from sb3_tdc.common.files import is_file_at, lock, sync, unlock, write_atomically
 
 Writer = Callable[[Path], Any]
 
@@ -196,15 +196,8 @@ class Store:
         :raises OSError: if the file cannot be written; no part of it stays
         """
         path = self.folder / _SHARED / name
-        part = path.with_name(f".{name}")
-        try:
-            digest = _write(part, write)
-            os.replace(part, path)
-            _sync_folder(path.parent)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-        return digest
+        write_atomically(write, path)
+        return _sha256(path)
 
     def write(self, step: int, files: dict[str, Writer], shared: dict[str, str]) -> Stored:
         """
@@ -223,9 +216,9 @@ class Store:
             text = json.dumps({"format": _FORMAT, "step": step, "files": digests, "shared": shared})
             manifest = f"{text}\n{hashlib.sha256(text.encode()).hexdigest()}\n"
             _write(part / _MANIFEST, lambda file: file.write_text(manifest))
-            _sync_folder(part)
+            sync(part)
             os.replace(part, path)
-            _sync_folder(self.folder)
+            sync(self.folder)
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
@@ -300,8 +293,7 @@ def _kept(steps: list[int], keep: int, span: int) -> list[int]:
 
 def _write(path: Path, write: Writer) -> str:
     write(path)
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
+    sync(path)
     return _sha256(path)
 
 
@@ -311,16 +303,6 @@ def _sha256(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _sync_folder(path: Path) -> None:
-    if os.name == "nt":  # Windows cannot open a folder
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _lock(path: Path) -> Any:

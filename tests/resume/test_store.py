@@ -4,6 +4,7 @@ import errno
 import fcntl
 import os
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ import warnings
 
 import pytest
 
+from sb3_tdc.common.files import write_atomically
 from sb3_tdc.experiments.jobs import Job
 from sb3_tdc.resume.store import BrokenStateError, LockedError, Store
 from tests.helpers.paths import ROOT
@@ -134,6 +136,26 @@ def test_a_full_disk_leaves_no_trace(store, monkeypatch):
             write(store, 2)
     assert names(store.folder) == before
     assert store.newest().step == 1
+
+
+@pytest.mark.parametrize("number", [None, errno.EINVAL])
+def test_a_file_is_on_disk_before_it_gets_its_name_and_its_name_before_the_call_returns(tmp_path, monkeypatch, number):
+    """Also where the file system cannot sync folders; after a run's last file, its states are removed."""
+    calls, fsync, replace = [], os.fsync, os.replace
+
+    def record(descriptor):
+        found = os.fstat(descriptor)
+        calls.append(found.st_ino)
+        if number is not None and stat.S_ISDIR(found.st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", record)
+    monkeypatch.setattr(os, "replace", lambda *paths: calls.append("replace") or replace(*paths))
+    path = tmp_path / "model.zip"
+    write_atomically(lambda part: part.write_bytes(b"weights"), path)
+    assert calls == [path.stat().st_ino, "replace", tmp_path.stat().st_ino]
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_one_process_at_a_time(store):
