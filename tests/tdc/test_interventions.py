@@ -538,6 +538,36 @@ def test_a_copied_model_learns_on_its_own(stochastic_actor):
     assert_close(states(reference), states(copied), rtol=0, atol=0)
 
 
+def with_networks_of_its_own(original):
+    """Return a shallow copy of a model that has another policy, optimizers included, and γ = 0."""
+    model = copy.copy(original)
+    model.policy = copy.deepcopy(original.policy)
+    for name in ("actor", "actor_target", "critic", "critic_target"):
+        setattr(model, name, getattr(model.policy, name))
+    model.gamma = 0.0
+    return model
+
+
+def test_a_shallow_copy_trains_and_acts_by_itself():
+    finals, actions = [], []
+    for fused in (None, False):
+        original = make_model(fused=fused, gamma=0.9)
+        train(original, 1)
+        model, before = with_networks_of_its_own(original), states(original)
+        train(model, 2)
+        assert_close(before, states(original), rtol=0, atol=0)
+        assert (model._n_updates, original._n_updates) == (12, 6)
+        finals.append(states(model))
+        # a copy that has not been trained, from another observation and with another actor
+        untrained = with_networks_of_its_own(original)
+        nn.init.zeros_(untrained.actor.mu[-2].bias)
+        untrained._last_obs = np.ones((1, 3), np.float32)
+        actions.append(untrained._sample_action(0)[0])
+        np.testing.assert_allclose(actions[-1], untrained.predict(untrained._last_obs)[0], atol=1e-6)
+    assert_close(*finals, rtol=1e-3, atol=2e-5)
+    np.testing.assert_allclose(*actions, atol=1e-4)
+
+
 # ---------------------------------------------------------------- settings read in mid-run
 
 

@@ -47,9 +47,15 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
         if self.verbose > 0 and self.fused is None:
             self._tell_which_update()
 
+    @property
+    def _own_fused_update(self) -> FusedUpdate | None:
+        """Return the fused update that is bound to this model; a shallow copy also holds that of its original."""
+        bound = self._fused_update
+        return bound if bound is not None and bound.model is self else None
+
     def _bind_fused_update(self, batch_size: int) -> FusedUpdate | None:
         """Return the fused update, bound again if anything has changed, or None if the readable one is to be used."""
-        bound = self._fused_update
+        bound = self._own_fused_update
         if bound is not None and self.fused is not False and bound.fits(batch_size):
             return bound
         self._fused_update = None
@@ -78,7 +84,7 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
             self._bind_fused_update(self.batch_size)  # it also computes the actions
 
     def _sample_scaled_action(self, learning_starts: int, n_envs: int) -> np.ndarray:
-        fused = self._fused_update
+        fused = self._own_fused_update
         if fused is None or self.num_timesteps < learning_starts or not fused.acts():
             return super()._sample_scaled_action(learning_starts, n_envs)
         scaled_action = fused.act(np.ascontiguousarray(self._last_obs))
