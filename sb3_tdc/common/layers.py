@@ -1,6 +1,7 @@
-"""Layers that evaluate several networks in parallel."""
+"""Layers that evaluate several networks in parallel, and the mode of all layers of a network."""
 
 import math
+from collections.abc import Iterable
 
 import torch as th
 from torch import nn
@@ -34,3 +35,14 @@ class StackedLinear(nn.Module):
     def extra_repr(self) -> str:
         n_networks, in_features, out_features = self.weight.shape
         return f"n_networks={n_networks}, in_features={in_features}, out_features={out_features}"
+
+
+def are_in_mode(networks: Iterable[nn.Module], training: bool) -> bool:
+    """Return whether networks and all their modules are in training mode, or all in evaluation mode."""
+    modules: list[nn.Module | None] = list(networks)
+    for module in modules:  # a loop, because ``modules()`` takes several times as long
+        if module is not None:
+            if module.training != training:
+                return False
+            modules.extend(module._modules.values())
+    return True

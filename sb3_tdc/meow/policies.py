@@ -16,7 +16,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_tdc.common.layers import StackedLinear
+from sb3_tdc.common.layers import StackedLinear, are_in_mode
 from sb3_tdc.meow.flow import ConditionalFlow, Swish
 
 
@@ -223,7 +223,7 @@ class MEOWPolicy(BasePolicy):
     def set_training_mode(self, mode: bool) -> None:
         """Switch the mode of the flow, but never that of its target, which must not use dropout."""
         # SB3 calls this at every step; setting the mode of all modules would cost more than acting
-        if self.training != mode or self.network.training != mode:
+        if self.training != mode or not are_in_mode((self.network,), mode):
             self.network.set_training_mode(mode)
             self.training = mode
 

@@ -21,7 +21,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from sb3_tdc.common.checks import check_integer
-from sb3_tdc.common.layers import StackedLinear
+from sb3_tdc.common.layers import StackedLinear, are_in_mode
 
 
 class QuantileCritic(ContinuousCritic):
@@ -199,7 +199,7 @@ class TDCPolicy(TD3Policy):
 
     def set_training_mode(self, mode: bool) -> None:
         # SB3 calls this at every step; setting the mode of all modules would cost more than the actor's forward pass
-        if any(module.training != mode for module in (self, self.actor, self.critic)):
+        if self.training != mode or not are_in_mode((self.actor, self.critic), mode):
             super().set_training_mode(mode)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common import base_class
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
@@ -397,6 +397,22 @@ def test_policies_are_copied_and_pickled_after_an_update(stochastic_actor, fused
         assert np.array_equal(policy.predict(observations)[0], model.predict(observations)[0])
     observation = th.from_numpy(observations)
     assert th.equal(actor._predict(observation, True), model.actor._predict(observation, True))
+
+
+@pytest.mark.parametrize("algorithm", [TD3, TDC, MEOW])
+def test_a_module_replaced_between_predictions_has_the_mode_of_its_network(algorithm):
+    model = algorithm("MlpPolicy", TwoActions(), buffer_size=100, learning_starts=5, device="cpu")
+    observation = np.ones(3, np.float32)
+    expected, _ = model.predict(observation, deterministic=True)
+    network = model.policy.network if algorithm is MEOW else model.actor
+    dropout = nn.Dropout(0.5)
+    network.features_extractor.flatten = nn.Sequential(nn.Flatten(), dropout)
+    for _ in range(3):
+        assert np.array_equal(model.predict(observation, deterministic=True)[0], expected)
+    model.policy.set_training_mode(True)
+    dropout.eval()
+    model.policy.set_training_mode(True)
+    assert dropout.training
 
 
 # ---------------------------------------------------------------- the temperature
