@@ -31,9 +31,8 @@ from sb3_tdc import MEOW, TDC, NonFiniteError, load_safely
 from sb3_tdc.common.finite import find_non_finite
 from sb3_tdc.safe_load import UnsafeFileError
 from sb3_tdc.tdc.tdc import DIAGNOSTICS_INTERVAL
-from tests.helpers.tdc import TwoActions
+from tests.helpers.tdc import HEADS, TwoActions
 
-HEADS = pytest.mark.parametrize("stochastic_actor", [False, True], ids=["deterministic", "stochastic"])
 FUSED = pytest.mark.parametrize("fused", [False, None], ids=["readable", "fused"])
 
 
