@@ -12,15 +12,17 @@ import pytest
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.distributions import DiagGaussianDistribution, SquashedDiagGaussianDistribution
-from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.policies import BaseModel, BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.sac import policies as sac_policies
+from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import nn
 from torch.nn.modules.module import register_module_forward_hook
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from sb3_tdc import TDC
 from sb3_tdc.tdc.fused.replay import PackedReplay
-from sb3_tdc.tdc.policies import QuantileCritic, TanhGaussian
+from sb3_tdc.tdc.policies import QuantileCritic, TanhGaussian, TDCPolicy
 from tests.helpers.tdc import ACT, HEADS, BatchQueue, TwoActions, assert_close, make, make_model, random_batches, states
 
 CALLS: list[str] = []
@@ -332,6 +334,39 @@ def test_a_method_replaced_on_a_class_is_called(place, name, monkeypatch):
     model._last_obs = np.zeros((1, 3), np.float32)
     model._sample_action(0)
     assert name in CALLS
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        (TDC, "predict"),
+        *((BasePolicy, name) for name in ("predict", "scale_action", "unscale_action")),
+        *((TDCPolicy, name) for name in ("_predict", "set_training_mode")),
+        *((BaseModel, name) for name in ("obs_to_tensor", "extract_features")),
+        *((DeterministicActor, name) for name in ("forward", "_predict")),
+        *((cls, "forward") for cls in (FlattenExtractor, nn.Flatten, nn.Linear, nn.ReLU, nn.Tanh, nn.Sequential)),
+        (nn.Module, "__call__"),
+        (None, "predict"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else getattr(x, "__name__", "instance"),
+)
+def test_a_method_replaced_between_two_updates_acts_at_once(place, name, monkeypatch):
+    model = make_model()
+    train(model, 1)
+    assert model._fused_update.acts()
+    own = getattr(place or model, name)
+
+    def replacement(*args, **kwargs):
+        CALLS.append(name)
+        return own(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(place or model, name, replacement)
+        CALLS.clear()
+        model._last_obs = np.zeros((1, 3), np.float32)
+        model._sample_scaled_action(0, 1)
+        assert name in CALLS
+    assert model._fused_update.acts()
 
 
 @pytest.mark.parametrize(

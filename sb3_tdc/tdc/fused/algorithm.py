@@ -1,5 +1,6 @@
 """The choice of the update that trains a model and computes its actions: the fused one where it applies."""
 
+import operator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +15,7 @@ _FUSED_METHODS = (
     *("train", "update", "update_critics", "update_actor", "update_targets"),
     *("_sample_target_actions", "make_target", "_minimize", "predict"),
 )
+_methods_of = operator.attrgetter(*_FUSED_METHODS)
 
 
 class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
@@ -26,18 +28,21 @@ class FusedUpdateAlgorithm(CheckedOffPolicyAlgorithm):
 
     fused: bool | None
     # These methods of the direct subclass, as they were when it was defined
-    _readable_methods: ClassVar[dict[str, Any]]
+    _readable_methods: ClassVar[tuple[Any, ...]]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if FusedUpdateAlgorithm in cls.__bases__:
-            cls._readable_methods = {name: getattr(cls, name) for name in _FUSED_METHODS}
+            cls._readable_methods = _methods_of(cls)
+
+    def overrides_methods(self) -> bool:
+        """Return whether the class or this instance overrides a method that the fused update would not call."""
+        return _methods_of(type(self)) != self._readable_methods or not vars(self).keys().isdisjoint(_FUSED_METHODS)
 
     def overridden_methods(self) -> list[str]:
-        """Return the methods that the class or this instance overrides and that the fused update would not call."""
-        cls, attributes = type(self), vars(self)
-        own = self._readable_methods
-        return [name for name in own if getattr(cls, name) is not own[name] or name in attributes]
+        """Return the names of these methods."""
+        own = zip(_FUSED_METHODS, self._readable_methods, strict=True)
+        return [name for name, method in own if getattr(type(self), name) is not method or name in vars(self)]
 
     def _setup_fused_update(self) -> None:
         self._fused_update: FusedUpdate | None = None

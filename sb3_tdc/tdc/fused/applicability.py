@@ -31,7 +31,10 @@ _DENSITY = ("proba_distribution", "log_prob", "sample", "mode")
 REPLACED_METHODS: dict[type, dict[str, Any]] = {
     cls: {name: getattr(cls, name) for name in names}
     for cls, names in {
-        TDCPolicy: ("predict", "_predict", "obs_to_tensor", "unscale_action", "extract_features"),
+        TDCPolicy: (
+            *("predict", "_predict", "set_training_mode", "obs_to_tensor", "extract_features"),
+            *("scale_action", "unscale_action"),
+        ),
         DeterministicActor: ("forward", "_predict", "extract_features"),
         TanhGaussian: ("actions_from_params", "log_prob_from_params", "get_actions", *_DENSITY),
         DiagGaussianDistribution: _DENSITY,

@@ -36,9 +36,26 @@ def _equal(current: list[Any], copy: list[Any]) -> bool:
         return False
 
 
+class MethodSnapshot:
+    """
+    The methods, when the snapshot is taken, whose work the fused update does itself.
+
+    :param parts: instances of the classes that have these methods
+    """
+
+    def __init__(self, parts: Iterable[Any]):
+        classes = {cls for part in parts for cls in type(part).__mro__} & REPLACED_METHODS.keys()
+        self.methods_of = [(cls, operator.attrgetter(*REPLACED_METHODS[cls])) for cls in classes]
+        self.methods = [methods_of(cls) for cls, methods_of in self.methods_of]
+
+    def is_current(self) -> bool:
+        """Return whether no method has been replaced on a class."""
+        return [methods_of(cls) for cls, methods_of in self.methods_of] == self.methods
+
+
 class ModuleSnapshot:
     """
-    The state of modules when the snapshot is taken.
+    The state of modules, and of the methods of their classes, when the snapshot is taken.
 
     :param modules: all modules of some networks
     """
@@ -49,7 +66,9 @@ class ModuleSnapshot:
         self.stochastic = [module for module in modules if isinstance(module, TanhGaussianActor)]
         self.distributions = [actor.action_dist for actor in self.stochastic]
         self.constants = list(map(constants_of, self.distributions))
-        self.attributes = [vars(part) for part in (*modules, *self.distributions)]
+        parts = [*modules, *self.distributions]
+        self.methods = MethodSnapshot(parts)
+        self.attributes = list(map(vars, parts))
         self.n_attributes = list(map(len, self.attributes))
         self.contents = [d for module in modules for d in (module._modules, module._parameters) if d]
         self.values = gc.get_referents(*self.contents)
@@ -66,6 +85,7 @@ class ModuleSnapshot:
             and list(map(constants_of, self.distributions)) == self.constants
             and _equal(gc.get_referents(*self.contents), self.values)
             and list(map(th.Tensor.data_ptr, self.parameters)) == self.storage
+            and self.methods.is_current()
         )
 
 
@@ -90,11 +110,8 @@ class Snapshot:
         self.groups = [group for groups in self.group_lists for group in groups]
         self.options = [(list(params), *rest) for params, *rest in map(_options_of, self.groups)]
         self.learning = [parameter for params, *_ in self.options for parameter in params]
-        parts = [*policy.modules(), *self.modules.distributions, *optimizers]
-        classes = {cls for part in parts for cls in type(part).__mro__} & REPLACED_METHODS.keys()
-        self.methods_of = [(cls, operator.attrgetter(*REPLACED_METHODS[cls])) for cls in classes]
-        self.methods = [methods_of(cls) for cls, methods_of in self.methods_of]
-        self.overridden = model.overridden_methods
+        self.methods = MethodSnapshot(optimizers)
+        self.overrides_methods = model.overrides_methods
 
     def is_current(self) -> bool:
         """Return whether nothing has changed; a hook registered anywhere counts as a change."""
@@ -105,6 +122,6 @@ class Snapshot:
             and [id(group) for groups in self.group_lists for group in groups] == list(map(id, self.groups))
             and _equal(list(map(_options_of, self.groups)), self.options)
             and all(map(_requires_grad, self.learning))
-            and [methods_of(cls) for cls, methods_of in self.methods_of] == self.methods
-            and not self.overridden()
+            and self.methods.is_current()
+            and not self.overrides_methods()
         )

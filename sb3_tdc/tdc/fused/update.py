@@ -166,7 +166,8 @@ class FusedUpdate:
 
     def acts(self) -> bool:
         """Return whether :meth:`act` still computes what the policy does."""
-        return self.model.policy is self.policy and self.actor_snapshot.is_current()
+        model = self.model
+        return model.policy is self.policy and self.actor_snapshot.is_current() and not model.overrides_methods()
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """
