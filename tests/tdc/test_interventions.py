@@ -84,6 +84,35 @@ def replace_the_extractor(model):
     model.actor.features_extractor = Half(model.observation_space)
 
 
+def replace_the_module_in_the_extractors(model):
+    class Half(nn.Module):
+        def forward(self, observations):
+            CALLS.append("flatten")
+            return observations.flatten(1) / 2
+
+    for network in (model.actor, model.critic):
+        network.features_extractor.flatten = Half()
+
+
+def change_the_class_of_a_layer(model):
+    class Half(nn.Linear):
+        def forward(self, inputs):
+            CALLS.append("layer")
+            return super().forward(inputs) / 2
+
+    sequential, index = last_layer_of_actor(model)
+    sequential[index].__class__ = Half
+
+
+def change_the_class_of_a_container(model):
+    class Traced(nn.ModuleList):
+        def __iter__(self):
+            CALLS.append("layers")
+            return super().__iter__()
+
+    model.critic.layers.__class__ = Traced
+
+
 def optimize_the_last_layer_only(model):
     sequential, index = last_layer_of_actor(model)
     model.actor.optimizer = th.optim.Adam(sequential[index].parameters(), lr=1e-2)
@@ -212,6 +241,9 @@ CHANGES = [
     replace_an_activation,
     insert_a_layer,
     replace_the_extractor,
+    replace_the_module_in_the_extractors,
+    change_the_class_of_a_layer,
+    change_the_class_of_a_container,
     optimize_the_last_layer_only,
     optimize_in_another_order,
     add_a_group,
@@ -232,6 +264,9 @@ CHANGES = [
 ]
 CALLED = {
     replace_the_extractor: "extractor",
+    replace_the_module_in_the_extractors: "flatten",
+    change_the_class_of_a_layer: "layer",
+    change_the_class_of_a_container: "layers",
     replace_the_optimizers_step: "step",
     hook_a_parameter: "parameter hook",
     hook_after_accumulation: "accumulated",
@@ -286,6 +321,30 @@ def test_the_target_of_a_replaced_part_moves(tmp_path):
         train(model, 2, n=2)
         expected = (start + model.actor.mu[index].weight) / 2
         th.testing.assert_close(model.actor_target.mu[index].weight, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("fused", [None, False])
+def test_a_tensor_of_one_element_replaced_by_an_equal_one_is_noticed(fused):
+    """Equal tensors of one element are equal in Python's eyes; those of several elements cannot be compared."""
+
+    class OneAction(TwoActions):
+        action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    model = make(OneAction(), fused=fused)
+    model.replay_buffer.add(np.ones(3), np.ones(3), np.ones(1), np.ones(1), np.zeros(1), [{}])
+    model.train(4, 8)
+    last, optimizer = model.actor.mu[-2], model.actor.optimizer
+    state = optimizer.state[last.weight]
+    state["step"] = state["step"].clone()
+    model.train(4, 8)
+    assert state["step"] == 4  # with policy_delay = 2
+    trained, last.bias = last.bias, nn.Parameter(last.bias.detach().clone())
+    before = [trained.item(), last.bias.item()]
+    model.train(4, 8)
+    assert [trained.item(), last.bias.item()] == before  # the optimizer does not have the new one
+    optimizer.param_groups[0]["params"][-1] = last.bias
+    model.train(4, 8)
+    assert last.bias.item() != before[1] == trained.item()
 
 
 @pytest.mark.parametrize("register", [register_module_forward_hook, register_optimizer_step_pre_hook])

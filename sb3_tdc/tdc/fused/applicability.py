@@ -109,8 +109,9 @@ def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
         constants = constants_of(network.action_dist)
         if constants != (LOG_STD_MIN, LOG_STD_MAX, TANH_EPSILON):
             yield f"the limits of log σ, or the ε of its density, are not those of SB3: {constants}"
-    if type(network.features_extractor) is not FlattenExtractor:
-        yield f"the {name}'s features extractor is {type(network.features_extractor).__name__}"
+    extractor = [type(module) for module in network.features_extractor.modules()]
+    if extractor != [FlattenExtractor, nn.Flatten]:
+        yield f"the {name}'s features extractor is {', '.join(cls.__name__ for cls in extractor)}"
     if _stacks(network) is None:
         layers = [type(m).__name__ for m in network.modules() if not list(m.children())]
         yield f"the {name}'s layers are not linear ones with ReLU between them: {', '.join(layers)}"
@@ -128,13 +129,23 @@ def _replaced_methods(instance: Any) -> list[str]:
 
 def _stacks(network: Any) -> list[Any] | None:
     """Return the linear layers of a network in the order of its forward pass, or None if it has another structure."""
+    linear: type[nn.Module] = nn.Linear
+    ending: list[type[nn.Module]] = []
+    heads: list[nn.Module] = []
     if type(network) is QuantileCritic:
-        return _linear_layers(list(network.layers), StackedLinear, [])
-    if type(network) is DeterministicActor:
-        return _linear_layers(list(network.mu), nn.Linear, [nn.Tanh]) if type(network.mu) is nn.Sequential else None
-    if type(network.latent_pi) is not nn.Sequential or type(network.action_dist) is not TanhGaussian:
+        container, kind, linear = network.layers, nn.ModuleList, StackedLinear
+    elif type(network) is DeterministicActor:
+        container, kind, ending = network.mu, nn.Sequential, [nn.Tanh]
+    elif type(network.action_dist) is TanhGaussian:
+        container, kind, heads = network.latent_pi, nn.Sequential, [network.mu, network.log_std]
+    else:
         return None
-    return _linear_layers([*network.latent_pi, network.mu, network.log_std], nn.Linear, [], n_outputs=2)
+    if type(container) is not kind:
+        return None
+    layers = [*container, *heads]
+    if set(network.modules()) != {network, container, *layers, *network.features_extractor.modules()}:
+        return None
+    return _linear_layers(layers, linear, ending, n_outputs=len(heads) or 1)
 
 
 def _linear_layers(

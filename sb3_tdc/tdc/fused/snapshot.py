@@ -3,8 +3,8 @@ Snapshots that detect a change of anything that can influence an update.
 
 Modules, parameters, their storage, the state and options of the optimizers, methods on classes and instances, and hooks
 are compared by identity, at every call of ``train``, after matrix products have evicted them from the caches. So as few
-objects as possible are read: of a module its children, its parameters and the number of its attributes (one more if a
-method is replaced on the instance); of hooks, only how many have been registered in this process.
+objects as possible are read: of a module its class, its children, its parameters and the number of its attributes (one
+more if a method is replaced on the instance); of hooks, only how many have been registered in this process.
 """
 
 import gc
@@ -20,7 +20,7 @@ from torch.utils.hooks import RemovableHandle
 from sb3_tdc.tdc.fused.applicability import REPLACED_METHODS, constants_of
 
 _options_of = operator.itemgetter(  # all but the learning rate, which may change
-    *("params", "betas", "eps", "weight_decay", "amsgrad", "maximize", "differentiable", "capturable")
+    *("betas", "eps", "weight_decay", "amsgrad", "maximize", "differentiable", "capturable")
 )
 _settings_of = operator.attrgetter(
     *("policy", "actor", "actor_target", "critic", "critic_target", "actor.optimizer", "critic.optimizer"),
@@ -29,9 +29,13 @@ _settings_of = operator.attrgetter(
 _requires_grad = operator.attrgetter("requires_grad")
 
 
+def _same(current: list[Any], copy: list[Any]) -> bool:
+    return len(current) == len(copy) and all(map(operator.is_, current, copy))
+
+
 def _equal(current: list[Any], copy: list[Any]) -> bool:
     try:
-        return current == copy  # by identity first; comparing two different tensors gives no truth value
+        return current == copy  # two different tensors with several elements have no truth value
     except (RuntimeError, ValueError, TypeError):
         return False
 
@@ -66,9 +70,10 @@ class ModuleSnapshot:
         self.stochastic = [module for module in modules if isinstance(module, TanhGaussianActor)]
         self.distributions = [actor.action_dist for actor in self.stochastic]
         self.constants = list(map(constants_of, self.distributions))
-        parts = [*modules, *self.distributions]
-        self.methods = MethodSnapshot(parts)
-        self.attributes = list(map(vars, parts))
+        self.parts = [*modules, *self.distributions]
+        self.classes = list(map(type, self.parts))
+        self.methods = MethodSnapshot(self.parts)
+        self.attributes = list(map(vars, self.parts))
         self.n_attributes = list(map(len, self.attributes))
         self.contents = [d for module in modules for d in (module._modules, module._parameters) if d]
         self.values = gc.get_referents(*self.contents)
@@ -80,10 +85,11 @@ class ModuleSnapshot:
         # The referents of dictionaries include all their values, in order: the fastest way to compare them
         return (
             RemovableHandle.next_id == self.n_hooks
+            and list(map(type, self.parts)) == self.classes
             and list(map(len, self.attributes)) == self.n_attributes
             and [actor.action_dist for actor in self.stochastic] == self.distributions
             and list(map(constants_of, self.distributions)) == self.constants
-            and _equal(gc.get_referents(*self.contents), self.values)
+            and _same(gc.get_referents(*self.contents), self.values)
             and list(map(th.Tensor.data_ptr, self.parameters)) == self.storage
             and self.methods.is_current()
         )
@@ -108,8 +114,8 @@ class Snapshot:
         self.values = gc.get_referents(*self.contents)
         self.group_lists = [optimizer.param_groups for optimizer in optimizers]
         self.groups = [group for groups in self.group_lists for group in groups]
-        self.options = [(list(params), *rest) for params, *rest in map(_options_of, self.groups)]
-        self.learning = [parameter for params, *_ in self.options for parameter in params]
+        self.options = list(map(_options_of, self.groups))
+        self.learning = [parameter for group in self.groups for parameter in group["params"]]
         self.methods = MethodSnapshot(optimizers)
         self.overrides_methods = model.overrides_methods
 
@@ -118,8 +124,9 @@ class Snapshot:
         return (
             _settings_of(self.model) == self.settings
             and self.modules.is_current()
-            and _equal(gc.get_referents(*self.contents), self.values)
-            and [id(group) for groups in self.group_lists for group in groups] == list(map(id, self.groups))
+            and _same(gc.get_referents(*self.contents), self.values)
+            and _same([group for groups in self.group_lists for group in groups], self.groups)
+            and _same([parameter for group in self.groups for parameter in group["params"]], self.learning)
             and _equal(list(map(_options_of, self.groups)), self.options)
             and all(map(_requires_grad, self.learning))
             and self.methods.is_current()
