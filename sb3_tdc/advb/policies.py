@@ -32,7 +32,8 @@ class AdvisedPolicy(BasePolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)  # type: ignore[misc]
-        self.board = Board([self.make_actor() for _ in range(self.n_members)])  # type: ignore[operator]
+        with th.random.fork_rng(devices=[]):  # the board draws no random numbers of the training
+            self.board = Board([self.make_actor() for _ in range(self.n_members)])  # type: ignore[operator]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "n_members": self.n_members}
