@@ -392,13 +392,12 @@ class TDC(FusedUpdateAlgorithm):
         :param ent_coef: (1,), α of the actor's update
         :param actor_loss: scalar, for the log
         """
-        self.diagnose(actor_loss=actor_loss, entropy=-log_prob.mean(), ent_coef=ent_coef.squeeze())
-        if self._learns_ent_coef and self.log_ent_coef.requires_grad:
-            # The loss −log α·mean(log π + H_target) is linear in log α
-            gradient = -(log_prob + self._current_target_entropy()).mean(dim=0, keepdim=True)
-            self.diagnose(ent_coef_loss=(self.log_ent_coef.detach() * gradient).squeeze())
-            self.log_ent_coef.grad = gradient
-            self.ent_coef_optimizer.step()
+        entropy = -log_prob.mean()
+        self.diagnose(actor_loss=actor_loss, entropy=entropy, ent_coef=ent_coef.squeeze())
+        if self._learns_ent_coef:
+            loss = self.log_ent_coef * (entropy - self._current_target_entropy())
+            self._minimize(loss, self.ent_coef_optimizer)
+            self.diagnose(ent_coef_loss=loss.detach().squeeze())
 
     def current_ent_coef(self) -> th.Tensor:
         """Return α, (1,)."""

@@ -680,6 +680,22 @@ def test_sb3s_learning_rate_schedule_is_read(fused):
 
 
 @pytest.mark.parametrize("fused", [None, False])
+def test_a_hook_on_the_temperature_is_called(fused):
+    model = make_model(stochastic_actor=True, fused=fused)
+    train(model, 1)
+    gradients = []
+
+    def replace(gradient):
+        gradients.append(gradient.item())
+        return th.full_like(gradient, 7.0)
+
+    model.log_ent_coef.register_hook(replace)
+    train(model, 2, n=2)
+    assert len(gradients) == 1
+    assert gradients[0] != model.log_ent_coef.grad.item() == 7.0
+
+
+@pytest.mark.parametrize("fused", [None, False])
 def test_a_target_entropy_changed_in_mid_run_is_read(fused):
     gradients = []
     for target in (-100.0, 100.0):  # the gradient of log α is −mean(log π + H), on the same samples
