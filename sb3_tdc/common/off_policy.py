@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_tdc.common.checks import (
     OFF_POLICY_LIMITS,
@@ -117,6 +118,14 @@ class CheckedOffPolicyAlgorithm(NoisyOffPolicyAlgorithm):
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
         self._scheduled_learning_rate = self.learning_rate
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
+            update_learning_rate(optimizer, self.scheduled(self._schedule_of(optimizer)))
+
+    def _schedule_of(self, optimizer: th.optim.Optimizer) -> str:
+        """Return which of ``schedules`` is the learning rate of an optimizer."""
+        return "learning_rate"
 
     # ---------------------------------------------------------------- logging
 

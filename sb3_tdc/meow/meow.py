@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update, update_learning_rate
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 
 from sb3_tdc.common.checks import ABOVE_ZERO, OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
@@ -169,7 +169,7 @@ class MEOW(CheckedOffPolicyAlgorithm):
         ent_coef = check_within(self.limits, "ent_coef", self.ent_coef)
         self._pass_gamma_to_replay_buffer()
         self.policy.set_training_mode(True)
-        update_learning_rate(self.policy.optimizer, self.scheduled("learning_rate"))
+        self._update_learning_rate(self.policy.optimizer)
         statistics, target_statistics = (
             get_parameters_by_name(network, ["running_"]) for network in (self.network, self.network_target)
         )

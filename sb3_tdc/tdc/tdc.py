@@ -14,7 +14,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
+from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_tdc.common.checks import (
@@ -228,8 +228,7 @@ class TDC(FusedUpdateAlgorithm):
         self._check_limits("kappa", "target_policy_noise", "target_noise_clip", "policy_delay")
         for name in ("n_quantiles", "n_critics"):
             check_within(self.limits, name, self.policy_kwargs.get(name, 1), f"policy_kwargs[{name!r}]")
-        if self.target_entropy != "auto":
-            check_number('target_entropy (if not "auto")', self.target_entropy)
+        self.target_entropy = self._current_target_entropy()
         self._initial_ent_coef()
         if "stochastic_actor" in self.policy_kwargs:
             raise ValueError("stochastic_actor must be an argument of TDC itself, not one of policy_kwargs")
@@ -309,7 +308,7 @@ class TDC(FusedUpdateAlgorithm):
         lam = self.scheduled("lam")
         self._pass_gamma_to_replay_buffer()
         self._renew_temperature()
-        self._update_learning_rates()
+        self._update_learning_rate(self._optimizers())
         fused_update = self._bind_fused_update(batch_size)
         if fused_update is None:
             self.policy.set_training_mode(True)
@@ -436,19 +435,16 @@ class TDC(FusedUpdateAlgorithm):
             output.backward(grad_output, inputs=learning)
         optimizer.step()
 
-    def _update_learning_rates(self) -> None:
-        learning_rate = self.scheduled("learning_rate")
-        update_learning_rate(self.actor.optimizer, learning_rate)  # type: ignore[arg-type]
-        update_learning_rate(self.critic.optimizer, self.scheduled("qf_learning_rate"))
-        if self.ent_coef_optimizer is not None:
-            update_learning_rate(self.ent_coef_optimizer, learning_rate)
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        of_temperature = [self.ent_coef_optimizer] if self._learns_ent_coef else []
+        return [self.actor.optimizer, self.critic.optimizer, *of_temperature]  # type: ignore[list-item]
+
+    def _schedule_of(self, optimizer: th.optim.Optimizer) -> str:
+        return "qf_learning_rate" if optimizer is self.critic.optimizer else super()._schedule_of(optimizer)
 
     def _flush_moments(self) -> None:
         """Set those moments of Adam to zero that are about to become denormal numbers."""
-        optimizers: list[Any] = [self.actor.optimizer, self.critic.optimizer]
-        if self.stochastic_actor and self._learns_ent_coef:
-            optimizers.append(self.ent_coef_optimizer)
-        for state in (state for optimizer in optimizers for state in optimizer.state.values()):
+        for state in (state for optimizer in self._optimizers() for state in optimizer.state.values()):
             for moment in (state[name] for name in ("exp_avg", "exp_avg_sq") if name in state):
                 moment.masked_fill_(moment.abs() < SMALLEST_MOMENT, 0)
 

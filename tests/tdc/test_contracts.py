@@ -103,6 +103,27 @@ def test_a_schedule_may_return_whatever_float_takes(convert):
     assert model.critic.optimizer.param_groups[0]["lr"] == pytest.approx(0.001)
 
 
+@pytest.mark.parametrize("algorithm", [SAC, TDC, MEOW])
+def test_a_subclass_may_set_the_learning_rates(algorithm):
+    given = []
+
+    class Fixed(algorithm):
+        def _update_learning_rate(self, optimizers):
+            given.extend(optimizers if isinstance(optimizers, list) else [optimizers])
+            for optimizer in given:
+                optimizer.param_groups[0]["lr"] = 0.125
+
+    head = {"stochastic_actor": True} if algorithm is TDC else {}
+    model = Fixed("MlpPolicy", TwoActions(), learning_starts=3, batch_size=4, buffer_size=100, device="cpu", **head)
+    if algorithm is MEOW:
+        expected = [model.policy.optimizer]
+    else:
+        expected = [model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer]
+    model.learn(4)
+    assert list(map(id, given)) == list(map(id, expected))
+    assert {optimizer.param_groups[0]["lr"] for optimizer in expected} == {0.125}
+
+
 @pytest.mark.parametrize("value", [th.ones(2), np.ones(2), "0.1", True, None, 1j], ids=str)
 def test_what_is_no_number_is_named(value):
     with pytest.raises(ValueError, match=r"lam \(a schedule, at progress remaining 1\) must be a finite number"):
@@ -429,6 +450,27 @@ def test_a_fixed_temperature_has_no_logarithm_and_no_optimizer(tmp_path, algorit
         model.save(tmp_path / "model")
         for loaded in (algorithm.load(tmp_path / "model"), load_safely(tmp_path / "model", device="cpu")):
             assert (loaded.log_ent_coef is not None, loaded.ent_coef_optimizer is not None) == (learned, learned)
+
+
+@pytest.mark.parametrize("algorithm", [SAC, TDC])
+def test_the_target_entropy_is_a_number(tmp_path, algorithm):
+    """Of two actions: −2."""
+    head = {"stochastic_actor": True} if algorithm is TDC else {}
+    model = algorithm("MlpPolicy", TwoActions(), buffer_size=100, learning_starts=5, batch_size=4, **head)
+    assert (type(model.target_entropy), model.target_entropy) == (float, -2.0)
+
+    def lower(model):
+        model.target_entropy -= 0.5
+
+    model.learn(4, callback=Each(lower))
+    assert model.target_entropy == -4.0
+    for saved in (-4.0, "auto"):
+        model.target_entropy = saved
+        model.save(tmp_path / "model")
+        for read in (algorithm.load, load_safely):
+            read_again = functools.partial(read, tmp_path / "model", env=TwoActions(), device="cpu")
+            assert read_again().target_entropy == (-2.0 if saved == "auto" else -4.0)
+            assert read_again(target_entropy="auto").target_entropy == -2.0
 
 
 def test_the_deterministic_head_has_no_temperature(tmp_path):
