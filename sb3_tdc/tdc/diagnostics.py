@@ -5,11 +5,14 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.sac.policies import Actor as TanhGaussianActor
+from stable_baselines3.td3.policies import Actor as DeterministicActor
 from torch import nn
 
 from sb3_tdc.common.layers import StackedLinear
 from sb3_tdc.tdc.dormant import dormant_share, relu_activations
 from sb3_tdc.tdc.lam import describe_selection
+from sb3_tdc.tdc.policies import QuantileCritic
 from sb3_tdc.tdc.quantiles import Target, quantile_huber_loss
 
 # Modules whose forward pass changes no state
@@ -47,7 +50,7 @@ def describe_units(model: Any, observations: Any) -> dict[str, th.Tensor]:
     :return: scalars by name; none unless the networks are linear layers and ReLUs on flat observations
     """
     actor, critic = model.actor, model.critic
-    if not _has_plain_units(actor, critic, model.observation_space):
+    if not _has_plain_units(model):
         return {}
     features = actor.extract_features(observations, actor.features_extractor)
     of_actor, outputs = relu_activations(actor.latent_pi if model.stochastic_actor else actor.mu, features)
@@ -59,7 +62,16 @@ def describe_units(model: Any, observations: Any) -> dict[str, th.Tensor]:
     return {"actor_dormant": dormant_share(of_actor), "critic_dormant": dormant_share(of_critics)}
 
 
-def _has_plain_units(actor: nn.Module, critic: nn.Module, observation_space: spaces.Space) -> bool:
-    """Return whether the networks are linear layers and ReLUs on flat observations."""
+def _has_plain_units(model: Any) -> bool:
+    """Return whether the networks are TDC's own: sequences of linear layers and ReLUs on flat observations."""
+    actor, critic = model.actor, model.critic
+    own_actor = TanhGaussianActor if model.stochastic_actor else DeterministicActor
+    if not (isinstance(actor, own_actor) and isinstance(critic, QuantileCritic)):
+        return False
+    sequences = (actor.latent_pi if isinstance(actor, TanhGaussianActor) else actor.mu, critic.layers)
     inner = [module for network in (actor, critic) for module in network.modules() if module not in (actor, critic)]
-    return all(type(module) in _PLAIN for module in inner) and isinstance(observation_space, spaces.Box)
+    return (
+        isinstance(model.observation_space, spaces.Box)
+        and all(isinstance(sequence, (nn.Sequential, nn.ModuleList)) for sequence in sequences)
+        and all(type(module) in _PLAIN for module in inner)
+    )

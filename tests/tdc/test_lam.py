@@ -10,6 +10,7 @@ from hypothesis.extra.numpy import arrays
 from torch import nn
 
 from sb3_tdc.tdc import tdc
+from sb3_tdc.tdc.diagnostics import describe_units
 from sb3_tdc.tdc.dormant import dormant_share, relu_activations
 from sb3_tdc.tdc.lam import critical_lam, describe_selection
 from sb3_tdc.tdc.quantiles import Target, select_critic
@@ -111,6 +112,13 @@ def test_dormant_units_are_those_of_the_forward_pass():
     second = model.actor.mu[3](model.actor.mu[2](heard[0]))
     assert found == pytest.approx(dormant_share([heard[0], second]).item())
     assert 0 < found < 1
+
+
+@pytest.mark.parametrize(("network", "attribute"), [("actor", "mu"), ("critic", "layers"), (None, "actor")])
+def test_other_networks_have_no_units_to_count(network, attribute):
+    model = make(TwoActions())
+    setattr(getattr(model, network) if network else model, attribute, nn.Linear(3, 2))
+    assert describe_units(model, th.zeros(4, 3)) == {}
 
 
 @HEADS
