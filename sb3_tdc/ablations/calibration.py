@@ -177,16 +177,16 @@ class CalibratedTDC(TDC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        self._follow_episodes(buffer_action, reward, dones, infos)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        observations = self._last_obs
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # all values are finite
+        self._follow_episodes(observations, buffer_action, reward, dones, infos)
 
     def _follow_episodes(
-        self, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+        self, observations: Any, action: np.ndarray, reward: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
         """Add a step to the episodes, and change λ if enough steps of ended episodes have been collected."""
         normalization, calibration = self._vec_normalize_env, self._calibration
         rewards = reward if normalization is None else normalization.get_original_reward()
-        observations: Any = self._last_obs
         for i, episode in calibration.episodes.items():
             one = {k: v[i] for k, v in observations.items()} if isinstance(observations, dict) else observations[i]
             episode.add(one, action[i], float(rewards[i]))

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_tdc import load_safely
+from sb3_tdc import NonFiniteError, load_safely
 from sb3_tdc.ablations import calibration
 from sb3_tdc.ablations.calibration import (
     MAX_LAM,
@@ -318,6 +318,22 @@ def test_actions_without_axes(short_period):
 
 
 # ---------------------------------------------------------------- saving and continuing
+
+
+def test_a_reward_that_is_not_finite_calibrates_nothing(tmp_path, monkeypatch):
+    class Broken(TwoActions):
+        def step(self, action):
+            observation, reward, terminated, truncated, info = super().step(action)
+            return observation, np.nan if terminated else reward, terminated, truncated, info
+
+    monkeypatch.setattr(calibration, "PERIOD", 7)
+    model = make_fast(Broken(), learning_starts=1)
+    with pytest.raises(NonFiniteError, match=r"environment returned a non-finite reward .* at timestep 12"):
+        model.learn(20)
+    assert (model.calibrated, model.error_scale) == (model.lam, 0.0)
+    model.save(tmp_path / "model")
+    loaded = load_safely(tmp_path / "model", algorithm=CalibratedTDC, device="cpu")
+    assert loaded.calibrated == model.lam
 
 
 def test_it_is_saved_and_continues(tmp_path, short_period):
