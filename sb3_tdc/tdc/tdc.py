@@ -335,7 +335,7 @@ class TDC(FusedUpdateAlgorithm):
             self.update_actor(replay_data)
             self.update_targets()
         if self.diagnoses_units:
-            self.diagnose_units(replay_data)
+            self.diagnose_units(replay_data.observations)
 
     def update_critics(self, replay_data: ReplayBufferSamples, lam: float) -> None:
         """Take one step of the critics (Eq. 1–10)."""
@@ -482,13 +482,13 @@ class TDC(FusedUpdateAlgorithm):
         """
         self.diagnose(**describe_critics(current, target, self.kappa))
 
-    def diagnose_units(self, replay_data: ReplayBufferSamples) -> None:
+    def diagnose_units(self, observations: Any) -> None:
         """
         Add the shares of dormant units to the log.
 
-        :param replay_data: a minibatch, of which only the observations are used
+        :param observations: those of a minibatch
         """
-        self.diagnose(**describe_units(self, replay_data.observations))
+        self.diagnose(**describe_units(self, observations))
 
     # ---------------------------------------------------------------- saving
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import nn
 
+from sb3_tdc import TDC
 from sb3_tdc.tdc import tdc
 from sb3_tdc.tdc.diagnostics import describe_units
 from sb3_tdc.tdc.dormant import dormant_share, relu_activations
@@ -84,6 +85,22 @@ def test_activations_are_those_of_the_layers():
     assert th.equal(output, layers[2](hidden))
 
 
+@pytest.mark.parametrize("fused", [False, None], ids=["readable", "fused"])
+def test_an_override_gets_the_observations_of_the_minibatch(fused, monkeypatch):
+    class Recording(TDC):
+        def diagnose_units(self, observations):
+            self.seen = observations.clone()
+
+    monkeypatch.setattr(tdc, "UNITS_INTERVAL", 2)
+    model = make(TwoActions(), algorithm=Recording, fused=fused)
+    stored = np.arange(12.0).reshape(4, 3)
+    for observation in stored:
+        model.replay_buffer.add(observation, -observation, np.ones(2), np.ones(1), np.zeros(1), [{}])
+    model.train(2, 16)
+    assert (model._fused_update is None) is (fused is False)
+    assert {tuple(row) for row in model.seen.tolist()} <= {tuple(row) for row in stored.tolist()}
+
+
 class Pixels(TwoActions):
     """Observations that SB3 divides by 255."""
 
@@ -107,7 +124,7 @@ def test_dormant_units_are_those_of_the_forward_pass():
     batch = model.replay_buffer.sample(16)
     model.actor(batch.observations)
     hook.remove()
-    model.diagnose_units(batch)
+    model.diagnose_units(batch.observations)
     found = model._diagnostics.fetch()["actor_dormant"]
     second = model.actor.mu[3](model.actor.mu[2](heard[0]))
     assert found == pytest.approx(dormant_share([heard[0], second]).item())

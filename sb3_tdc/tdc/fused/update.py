@@ -138,7 +138,7 @@ class FusedUpdate:
             self.update_actor()
             self.update_targets()
         if model.diagnoses_units:
-            model.diagnose_units(replay_data)
+            model.diagnose_units(replay_data.observations)  # the actor has overwritten the actions
 
     def sample(self) -> ReplayBufferSamples:
         """Return a minibatch of the model's replay buffer; from a packed one, the next minibatch overwrites it."""
