@@ -437,7 +437,7 @@ class TDC(FusedUpdateAlgorithm):
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         of_temperature = [self.ent_coef_optimizer] if self._learns_ent_coef else []
-        return [self.actor.optimizer, self.critic.optimizer, *of_temperature]  # type: ignore[list-item]
+        return [self.actor.optimizer, self.critic.optimizer, *of_temperature]
 
     def _schedule_of(self, optimizer: th.optim.Optimizer) -> str:
         return "qf_learning_rate" if optimizer is self.critic.optimizer else super()._schedule_of(optimizer)

@@ -95,7 +95,7 @@ def obstacles(model: Any) -> list[str]:
     return found
 
 
-def _network_obstacles(name: str, network: nn.Module) -> Iterator[str]:
+def _network_obstacles(name: str, network: Any) -> Iterator[str]:
     """Yield the reasons why a network is not one of the known ReLU networks."""
     if type(network) not in (DeterministicActor, TanhGaussianActor, QuantileCritic):
         yield f"the {name} is a custom class, {type(network).__qualname__}"
@@ -129,9 +129,11 @@ def _replaced_methods(instance: Any) -> list[str]:
 
 def _stacks(network: Any) -> list[Any] | None:
     """Return the linear layers of a network in the order of its forward pass, or None if it has another structure."""
+    kind: type[nn.Module]
     linear: type[nn.Module] = nn.Linear
     ending: list[type[nn.Module]] = []
     heads: list[nn.Module] = []
+    container: Any
     if type(network) is QuantileCritic:
         container, kind, linear = network.layers, nn.ModuleList, StackedLinear
     elif type(network) is DeterministicActor:
