@@ -34,13 +34,15 @@ class Call:
     Record of a call that a pickle would make, ``function(*args)``, and of what it would then do to the result.
 
     :param state: the state that the result would be set to (``__setstate__``)
-    :param items: the items that would be appended to the result, or the pairs that would be set in it
+    :param items: the items that would be appended to the result
+    :param pairs: the keys and values that would be set in the result; only their keys are known to be cheap to hash
     """
 
     function: Any
     args: Any
     state: Any = None
     items: list[Any] = field(default_factory=list)
+    pairs: list[tuple[Any, Any]] = field(default_factory=list)
 
 
 PERSISTENT = Name("pickle", "persistent_load")
@@ -265,7 +267,7 @@ def _set_items(target: Any, items: list[Any]) -> None:
     if not all(_is_key(key) for key, _ in pairs):
         raise UnsafeFileError("a mapping with keys that are more than small integers and texts")
     if isinstance(target, Call):
-        target.items.extend(pairs)
+        target.pairs.extend(pairs)
     elif isinstance(target, dict):
         target.update(pairs)
     else:
@@ -345,14 +347,14 @@ class Handler:
     :param make: makes the object from the record of the call and the :class:`Rebuild` for its parts
     :param args: the smallest and the largest number of arguments
     :param state: whether the object may be given a state
-    :param items: whether the object may be given items
+    :param pairs: whether the object may be given keys and values
     :param only: returns whether the arguments are accepted; called only if their number is allowed
     """
 
     make: Callable[[Call, Rebuild], Any]
     args: tuple[int, int] = (0, 0)
     state: bool = False
-    items: bool = False
+    pairs: bool = False
     only: Callable[..., bool] = lambda *_: True
 
     def __call__(self, call: Call, make: Rebuild) -> Any:
@@ -371,7 +373,7 @@ class Handler:
         return isinstance(call.args, tuple) and fewest <= len(call.args) <= most and self.only(*call.args)
 
     def _takes_changes(self, call: Call) -> bool:
-        return (call.state is not None) <= self.state and bool(call.items) <= self.items
+        return (call.state is not None) <= self.state and bool(call.pairs) <= self.pairs and not call.items
 
 
 def code_in(

@@ -228,7 +228,7 @@ def _train_freq(call: Call, make: Rebuild) -> TrainFreq:
 
 
 def _ordered_dict(call: Call, make: Rebuild) -> OrderedDict[Any, Any]:
-    return OrderedDict((key, make(item)) for key, item in call.items)
+    return OrderedDict((key, make(item)) for key, item in call.pairs)
 
 
 def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
@@ -284,7 +284,7 @@ def _of_numpy(make_scalar: Callable[[Call, Rebuild], Any]) -> dict[Name, Handler
     }
 
 
-_MAPPING = {Name("collections", "OrderedDict"): Handler(_ordered_dict, items=True)}
+_MAPPING = {Name("collections", "OrderedDict"): Handler(_ordered_dict, pairs=True)}
 # Calls that make plain values; NumPy scalars stay NumPy scalars
 PLAIN_CALLS: dict[Name, Handler] = {**_MAPPING, **_of_numpy(_numpy_scalar)}
 CALLS: dict[Name, Handler] = {

@@ -49,7 +49,7 @@ def read_tensors(raw: bytes, budget: Budget) -> Any:
     known = {
         Name("torch._utils", "_rebuild_tensor_v2"): Handler(tensors.make, args=(6, 7)),
         # The state is the attribute of a state dict, _metadata: the versions of its modules
-        Name("collections", "OrderedDict"): Handler(_make_dict, state=True, items=True),
+        Name("collections", "OrderedDict"): Handler(_make_dict, state=True, pairs=True),
     }
     return Rebuild({}, known, budget)(read_pickle(records["data.pkl"], budget))
 
@@ -57,7 +57,7 @@ def read_tensors(raw: bytes, budget: Budget) -> Any:
 def _make_dict(call: Call, make: Rebuild) -> dict:
     if call.state is not None and not (isinstance(call.state, dict) and set(call.state) == {"_metadata"}):
         raise UnsafeFileError("a mapping with attributes")
-    return {key: make(item) for key, item in call.items}
+    return {key: make(item) for key, item in call.pairs}
 
 
 class _Tensors:

@@ -67,6 +67,13 @@ def colliding_in_a_set() -> bytes:
     return b"\x80\x04" + b"\x8f" + Op.MARK + keys + b"\x90" + Op.STOP
 
 
+def colliding_in_appended_pairs(n: int = 20_000) -> bytes:
+    """The keys of an ``OrderedDict`` as pairs that are appended to it, not set in it."""
+    keys = b"".join(_long(i * (2**61 - 1)) + Op.NONE + b"\x86" for i in range(1, n))
+    mapping = Op.name("collections", "OrderedDict") + Op.EMPTY_TUPLE + Op.REDUCE
+    return Op.PROTO + mapping + Op.MARK + keys + Op.APPENDS + Op.STOP
+
+
 def text_as_key() -> bytes:
     return Op.PROTO + Op.EMPTY_DICT + Op.text("\x1b[31m" + "k" * 10**7) + Op.NONE + Op.SETITEM + Op.STOP
 
@@ -148,6 +155,7 @@ RAW = {
     "dicts doubled": doubled_dicts,
     "colliding keys": colliding,
     "colliding keys in a set": colliding_in_a_set,
+    "colliding keys in appended pairs": colliding_in_appended_pairs,
     "ten million operations": many_operations,
     "an integer of four million bytes": large_integer,
     "a name of ten million letters that clears the screen": long_name,

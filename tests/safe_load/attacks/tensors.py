@@ -7,6 +7,7 @@ from itertools import pairwise
 import torch as th
 from stable_baselines3 import TD3
 
+from tests.safe_load.attacks.pickles import colliding_in_appended_pairs
 from tests.safe_load.attacks.tools import Op, pth, rewrite, tensor, with_fields
 
 
@@ -73,6 +74,9 @@ ATTACKS = {
     "a bytearray of 2 GiB in an argument": _policy(tensor(10, (10,), (1,), more=_HUGE_BYTEARRAY), data_0=_NUMBERS),
     "two arguments too many": _policy(tensor(10, (10,), (1,), more=Op.NONE + Op.NONE), data_0=_NUMBERS),
     "items appended to a tensor": _policy(_GOOD + Op.NONE + Op.APPEND, data_0=_NUMBERS),
+    "colliding names of weights": lambda folder, model: rewrite(
+        model, folder / "x.zip", **{"policy.pth": pth(colliding_in_appended_pairs())}
+    ),
     "no exp_avg": changed("actor.optimizer.pth", lambda s: s["state"][0].pop("exp_avg")),
     "betas of text": changed("actor.optimizer.pth", lambda s: s["param_groups"][0].update(betas=("a", "b"))),
     "a step that is NaN": changed("actor.optimizer.pth", lambda s: s["state"][0].update(step=th.tensor(th.nan))),
