@@ -152,6 +152,7 @@ def _multi_discrete(call: Call, make: Rebuild) -> spaces.MultiDiscrete:
     (nvec,) = _attributes(call, make, "nvec")
     if not isinstance(nvec, np.ndarray) or nvec.size > MAX_CHOICES:
         raise UnsafeFileError(f"a MultiDiscrete space whose nvec is no array of at most {MAX_CHOICES:,} numbers")
+    make.budget.take_bytes(2 * 8 * nvec.size)  # MultiDiscrete keeps a copy and the first values, both as int64
     return spaces.MultiDiscrete(nvec)
 
 
@@ -173,9 +174,9 @@ def _ornstein_uhlenbeck_noise(call: Call, make: Rebuild) -> OrnsteinUhlenbeckAct
     theta, dt, initial = _attributes(call, make, "_theta", "_dt", "initial_noise")
     if initial is not None and not isinstance(initial, np.ndarray):
         raise UnsafeFileError("initial noise that is not an array")
-    return OrnsteinUhlenbeckActionNoise(
-        *_noise_arrays(call, make), check_number("theta", theta), check_number("dt", dt), initial
-    )
+    mean, sigma = _noise_arrays(call, make)
+    make.budget.take_bytes(mean.nbytes)  # it also keeps its last values
+    return OrnsteinUhlenbeckActionNoise(mean, sigma, check_number("theta", theta), check_number("dt", dt), initial)
 
 
 def _noise_range(call: Call, make: Rebuild) -> NormalNoiseRange:

@@ -40,12 +40,19 @@ from sb3_tdc.safe_load import budget, load_normalization, load_replay_buffer, we
 from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import foreign_names, saved_fields
-from sb3_tdc.safe_load.inert_pickle import read_pickle
+from sb3_tdc.safe_load.inert_pickle import Rebuild, read_pickle
+from sb3_tdc.safe_load.known_objects import CALLS, CLASSES
 from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
 from tests.safe_load.attacks.data import layers
-from tests.safe_load.attacks.pickles import choices_of_bytes, images_of_many_names, noise_of_bytes
+from tests.safe_load.attacks.pickles import (
+    choices_of_bytes,
+    choices_of_one_array,
+    images_of_many_names,
+    noise_of_bytes,
+    noise_of_one_array,
+)
 from tests.safe_load.attacks.tensors import one_storage
 from tests.safe_load.attacks.tools import Op, pickled
 from tests.safe_load.attacks.zips import crowd, understated
@@ -324,6 +331,18 @@ def test_numbers_of_eight_bytes_are_paid_for_before_they_are_made(saved, tmp_pat
     assert "a MultiDiscrete space whose nvec is no array of at most 65,536 numbers" in refuse(
         choices_of_bytes(tmp_path, saved)
     )
+
+
+@pytest.mark.parametrize("raw", [choices_of_one_array(2**14), noise_of_one_array(2**14)], ids=["space", "noise"])
+def test_copies_of_one_array_are_paid_for(raw):
+    spent = Budget(0)
+    spent.bytes = 2**24  # a thousand spaces hold 250 MiB, and as many noises 375 MiB
+    tracemalloc.start()
+    with pytest.raises(UnsafeFileError, match="far more memory"):
+        Rebuild(CLASSES, CALLS, spent)(read_pickle(raw, spent))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**24 + 2**21  # the records of the pickle take 1 MiB
 
 
 def test_a_smaller_buffer_than_the_files(saved, tmp_path):

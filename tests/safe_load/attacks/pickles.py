@@ -105,6 +105,28 @@ def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
     return Op.PROTO + array(bytes(size), "f4", size // 4) + Op.put(1) + Op.POP + dict_space(box, n) + Op.STOP
 
 
+_MULTI_DISCRETE = Op.name("gymnasium.spaces.multi_discrete", "MultiDiscrete")
+_ORNSTEIN_UHLENBECK = Op.name("stable_baselines3.common.noise", "OrnsteinUhlenbeckActionNoise")
+
+
+def copies_of_one_array(name: bytes, shared: tuple[str, ...], size: int, **others: bytes) -> bytes:
+    """A thousand objects of one state, each of which converts the same array of one-byte numbers."""
+    state = {**dict.fromkeys(shared, Op.get(1)), **others}
+    first = with_state(name, **state)[: -len(Op.BUILD)] + Op.put(2) + Op.BUILD
+    more = (name + Op.EMPTY_TUPLE + b"\x81" + Op.get(2) + Op.BUILD) * 1000
+    numbers = array(b"\1" * size, "u1", size) + Op.put(1) + Op.POP
+    return Op.PROTO + numbers + Op.EMPTY_LIST + Op.MARK + first + more + Op.APPENDS + Op.STOP
+
+
+def choices_of_one_array(size: int = 2**16) -> bytes:
+    return copies_of_one_array(_MULTI_DISCRETE, ("nvec",), size)
+
+
+def noise_of_one_array(size: int = 10**5) -> bytes:
+    numbers = dict.fromkeys(("_theta", "_dt"), Op.integer(1))
+    return copies_of_one_array(_ORNSTEIN_UHLENBECK, ("_mu", "_sigma"), size, **numbers, initial_noise=Op.NONE)
+
+
 def images_of_many_names(n: int = 900) -> bytes:
     """One image under many names: a network is built for every name."""
     size = (1, 36, 36)
@@ -148,7 +170,7 @@ def of_bytes(field: str, name: bytes, *attributes: str, size: int = 40_000_000):
 noise_of_bytes = of_bytes(
     "action_noise", Op.name("sb3_tdc.common.noise", "NormalNoiseRange"), "_mu", "smallest", "largest"
 )
-choices_of_bytes = of_bytes("observation_space", Op.name("gymnasium.spaces.multi_discrete", "MultiDiscrete"), "nvec")
+choices_of_bytes = of_bytes("observation_space", _MULTI_DISCRETE, "nvec")
 RAW = {
     "lists doubled": doubled,
     "tuples doubled": doubled_tuples,
@@ -175,6 +197,12 @@ ATTACKS = {
     "noise of forty million bytes": noise_of_bytes,
     "a MultiDiscrete of forty million bytes": choices_of_bytes,
     "nine hundred names of an image": many_images,
+    "a thousand MultiDiscretes of one array": lambda folder, model: with_fields(
+        model, folder / "x.zip", observation_space=pickled(choices_of_one_array())
+    ),
+    "a thousand noises of one array": lambda folder, model: with_fields(
+        model, folder / "x.zip", action_noise=pickled(noise_of_one_array())
+    ),
     "sixty boxes of one array": lambda folder, model: with_fields(
         model, folder / "x.zip", observation_space=pickled(boxes_of_one_array())
     ),
