@@ -48,6 +48,7 @@ class Call:
 PERSISTENT = Name("pickle", "persistent_load")
 
 _SCALARS = (str, bytes, int, float, bool, type(None))
+LETTERS = 32  # of a text, beyond which it counts as more than one value
 MAX_KEY = 2**32  # integers below it cannot be chosen so that their hashes collide
 
 
@@ -299,7 +300,7 @@ class Rebuild:
         :raises UnsafeFileError: if the part contains an unknown name or call; the error names it
         """
         if isinstance(part, (*_SCALARS, bytearray)):
-            self._count(1)
+            self._count(1 + len(part) // LETTERS if isinstance(part, str) else 1)
             return part
         if id(part) in self._finished:
             _, result, size = self._finished[id(part)]
@@ -317,6 +318,12 @@ class Rebuild:
         self._finished[id(part)] = (part, result, self._nodes - before)
         return result
 
+    def mapping(self, pairs: Mapping[Any, Any] | Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
+        """Rebuild the values of a mapping. Of its keys, which are plain, only long texts count."""
+        items = dict(pairs)
+        self._count(sum(len(key) // LETTERS for key in items if isinstance(key, str)))
+        return {key: self(item) for key, item in items.items()}
+
     def _count(self, n: int) -> None:
         self._nodes += n
         self.budget.take_nodes(n)
@@ -333,7 +340,7 @@ class Rebuild:
                 raise UnsafeFileError(f"a call of {part.function}")
             return self.calls[part.function](part, self)
         if isinstance(part, dict):
-            return {key: self(item) for key, item in part.items()}
+            return self.mapping(part)
         if isinstance(part, (list, tuple, set)):
             return type(part)(self(item) for item in part)
         raise UnsafeFileError(f"a {type(part).__name__}")

@@ -19,8 +19,9 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 
-from sb3_tdc.common.checks import check_integer, check_number
 from sb3_tdc.common.noise import NormalNoiseRange
+from sb3_tdc.common.saved_fields import integer, number
+from sb3_tdc.common.untrusted import shown
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import Call, Handler, Name, Rebuild
 from sb3_tdc.safe_load.reading import MAX_ITEMS
@@ -116,9 +117,11 @@ def _scalar(call: Call, make: Rebuild) -> Any:
 
 
 def _floats(value: Any, budget: Budget) -> np.ndarray:
-    """Convert numbers to float64, after taking the bytes for an array of them from the budget."""
+    """Convert a number, a list of numbers or an array to float64, after taking its bytes from the budget."""
     if isinstance(value, np.ndarray):
         budget.take_bytes(8 * value.size)
+    elif not all(isinstance(each, (int, float)) for each in (value if isinstance(value, (list, tuple)) else [value])):
+        raise UnsafeFileError("an array of something else than numbers")  # NumPy would also parse texts
     return np.asarray(value, dtype=np.float64)
 
 
@@ -135,7 +138,8 @@ def _box(call: Call, make: Rebuild) -> spaces.Box:
 
 def _dict_space(call: Call, make: Rebuild) -> spaces.Dict:
     (of_keys,) = _attributes(call, make, "spaces")
-    if not isinstance(of_keys, dict) or not all(isinstance(key, str) for key in of_keys):
+    is_of_names = isinstance(of_keys, dict) and all(isinstance(key, str) for key in of_keys)
+    if not is_of_names or not all(isinstance(part, spaces.Space) for part in of_keys.values()):
         raise UnsafeFileError("a Dict space without its spaces")
     if len(of_keys) > MAX_ITEMS:  # a network is built for each part
         raise UnsafeFileError(f"a Dict space of {len(of_keys):,} parts, more than {MAX_ITEMS}")
@@ -145,7 +149,7 @@ def _dict_space(call: Call, make: Rebuild) -> spaces.Dict:
 def _discrete(call: Call, make: Rebuild) -> spaces.Discrete:
     (n,) = _attributes(call, make, "n")
     start = make(_state(call).get("start", 0))
-    return spaces.Discrete(check_integer("n of a Discrete space", n, 1), start=start)
+    return spaces.Discrete(integer(1)("n of a Discrete space", n), start=start)
 
 
 def _multi_discrete(call: Call, make: Rebuild) -> spaces.MultiDiscrete:
@@ -158,7 +162,7 @@ def _multi_discrete(call: Call, make: Rebuild) -> spaces.MultiDiscrete:
 
 def _multi_binary(call: Call, make: Rebuild) -> spaces.MultiBinary:
     (n,) = _attributes(call, make, "n")
-    size = check_integer("n of a MultiBinary space", n, 1)
+    size = integer(1)("n of a MultiBinary space", n)
     make.budget.take_bytes(size)
     return spaces.MultiBinary(size)
 
@@ -176,7 +180,7 @@ def _ornstein_uhlenbeck_noise(call: Call, make: Rebuild) -> OrnsteinUhlenbeckAct
         raise UnsafeFileError("initial noise that is not an array")
     mean, sigma = _noise_arrays(call, make)
     make.budget.take_bytes(mean.nbytes)  # it also keeps its last values
-    return OrnsteinUhlenbeckActionNoise(mean, sigma, check_number("theta", theta), check_number("dt", dt), initial)
+    return OrnsteinUhlenbeckActionNoise(mean, sigma, number()("theta", theta), number()("dt", dt), initial)
 
 
 def _noise_range(call: Call, make: Rebuild) -> NormalNoiseRange:
@@ -202,16 +206,16 @@ def _base_noise(call: Call, make: Rebuild) -> Any:
 def _linear_schedule(call: Call, make: Rebuild) -> LinearSchedule:
     names = ("start", "end", "end_fraction")
     values = _attributes(call, make, *names)
-    return LinearSchedule(*(check_number(name, value) for name, value in zip(names, values, strict=True)))
+    return LinearSchedule(*(number()(name, value) for name, value in zip(names, values, strict=True)))
 
 
 def _zoo_schedule(call: Call, make: Rebuild) -> LinearSchedule:
     (initial,) = _attributes(call, make, "initial_value")
-    return LinearSchedule(check_number("initial_value", initial), 0.0, 1.0)
+    return LinearSchedule(number()("initial_value", initial), 0.0, 1.0)
 
 
 def _constant_schedule(call: Call, make: Rebuild) -> ConstantSchedule:
-    return ConstantSchedule(check_number("val", *_attributes(call, make, "val")))
+    return ConstantSchedule(number()("val", *_attributes(call, make, "val")))
 
 
 def _float_schedule(call: Call, make: Rebuild) -> FloatSchedule:
@@ -225,18 +229,18 @@ def _train_freq(call: Call, make: Rebuild) -> TrainFreq:
     frequency, unit = _arguments(call, make, 2)
     if not isinstance(unit, TrainFrequencyUnit):
         raise UnsafeFileError("a train_freq without its unit")
-    return TrainFreq(check_integer("frequency", frequency, 1), unit)
+    return TrainFreq(integer(1)("frequency", frequency), unit)
 
 
 def _ordered_dict(call: Call, make: Rebuild) -> OrderedDict[Any, Any]:
-    return OrderedDict((key, make(item)) for key, item in call.pairs)
+    return OrderedDict(make.mapping(call.pairs))
 
 
 def _running_mean_std(call: Call, make: Rebuild) -> RunningMeanStd:
     mean, var, count = _attributes(call, make, "mean", "var", "count")
     statistics = RunningMeanStd()
     statistics.mean, statistics.var = _floats(mean, make.budget), _floats(var, make.budget)
-    statistics.count = check_number("count", count, 0.0)
+    statistics.count = number(0.0)("count", count)
     finite = np.isfinite(statistics.mean).all() and np.isfinite(statistics.var).all()
     if not finite or (statistics.var < 0).any() or statistics.mean.shape != statistics.var.shape:
         raise UnsafeFileError("statistics that are not finite means and variances of one shape")
@@ -251,7 +255,11 @@ _ENUMS: dict[Name, type[Enum]] = {
 
 
 def _enum_of_value(call: Call, make: Rebuild) -> Enum:
-    return _ENUMS[call.function](*_arguments(call, make, 1))
+    (value,) = _arguments(call, make, 1)
+    for member in _ENUMS[call.function]:
+        if type(value) is type(member.value) and value == member.value:
+            return member
+    raise UnsafeFileError(f"{shown(value)} instead of a {_ENUMS[call.function].__name__}")
 
 
 def _enum_of_name(call: Call, make: Rebuild) -> Enum:

@@ -57,7 +57,7 @@ def read_tensors(raw: bytes, budget: Budget) -> Any:
 def _make_dict(call: Call, make: Rebuild) -> dict:
     if call.state is not None and not (isinstance(call.state, dict) and set(call.state) == {"_metadata"}):
         raise UnsafeFileError("a mapping with attributes")
-    return {key: make(item) for key, item in call.pairs}
+    return make.mapping(call.pairs)
 
 
 class _Tensors:

@@ -40,7 +40,7 @@ from sb3_tdc.safe_load import budget, load_normalization, load_replay_buffer, we
 from sb3_tdc.safe_load.archives import MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget
 from sb3_tdc.safe_load.fields import foreign_names, saved_fields
-from sb3_tdc.safe_load.inert_pickle import Rebuild, read_pickle
+from sb3_tdc.safe_load.inert_pickle import Call, Name, Rebuild, read_pickle
 from sb3_tdc.safe_load.known_objects import CALLS, CLASSES
 from sb3_tdc.safe_load.models import names_code
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
@@ -343,6 +343,35 @@ def test_copies_of_one_array_are_paid_for(raw):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 2**24 + 2**21  # the records of the pickle take 1 MiB
+
+
+@pytest.mark.parametrize("text", ["1" * 32_000, ("1" * 32_000, None)], ids=["value", "key"])
+def test_a_long_text_counts_as_often_as_it_is_reached(text):
+    def rebuild(times):
+        part = dict([text]) if isinstance(text, tuple) else text
+        Rebuild({}, {}, Budget(0))(read_pickle(pickle.dumps([part] * times), Budget(10**6)))
+
+    rebuild(490)  # each counts as 1,000 values, one for 32 letters, and the value itself
+    with pytest.raises(UnsafeFileError, match="more than 500,000 values"):
+        rebuild(500)
+
+
+_UNIT = Name("stable_baselines3.common.type_aliases", "TrainFrequencyUnit")
+
+
+@pytest.mark.parametrize(
+    ("name", "args", "state", "message"),
+    [
+        ("utils.ConstantSchedule", (), {"val": [[1]]}, "val must be a finite number, got a list"),
+        ("noise.NormalActionNoise", (), {"_mu": ["1"], "_sigma": [1]}, "an array of something else than numbers"),
+        ("type_aliases.TrainFreq", ([1], Call(_UNIT, ("step",))), None, "frequency must be an integer .* got a list"),
+        ("type_aliases.TrainFrequencyUnit", ([1],), None, "a list instead of a TrainFrequencyUnit"),
+    ],
+)
+def test_what_is_no_number_is_named_by_its_type(name, args, state, message):
+    module, kind = f"stable_baselines3.common.{name}".rsplit(".", 1)
+    with pytest.raises(ValueError, match=message):
+        Rebuild(CLASSES, CALLS, Budget(0))(Call(Name(module, kind), args, state))
 
 
 def test_a_smaller_buffer_than_the_files(saved, tmp_path):

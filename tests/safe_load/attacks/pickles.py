@@ -106,7 +106,25 @@ def boxes_of_one_array(n: int = 60, size: int = 6_000_000) -> bytes:
 
 
 _MULTI_DISCRETE = Op.name("gymnasium.spaces.multi_discrete", "MultiDiscrete")
+_CONSTANT_SCHEDULE = Op.name("stable_baselines3.common.utils", "ConstantSchedule")
+_NORMAL = Op.name("stable_baselines3.common.noise", "NormalActionNoise")
 _ORNSTEIN_UHLENBECK = Op.name("stable_baselines3.common.noise", "OrnsteinUhlenbeckActionNoise")
+
+
+def texts(n: int, length: int = 10**6) -> bytes:
+    """The opcodes of a list of n times the same text, which messages would show and NumPy would parse."""
+    first = Op.text("1" * length) + Op.put(1) + Op.POP
+    return Op.EMPTY_LIST + first + Op.MARK + Op.get(1) * n + Op.APPENDS
+
+
+def one_text_as(name: bytes, attribute: str, n: int, **others: bytes) -> bytes:
+    return Op.PROTO + with_state(name, **{attribute: texts(n)}, **others) + Op.STOP
+
+
+def quantiles_of_texts() -> bytes:
+    """Lists that are short enough to be an argument of a network."""
+    lists = texts(60) + Op.put(2) + Op.POP + Op.EMPTY_LIST + Op.MARK + Op.get(2) * 5 + Op.APPENDS + Op.put(3) + Op.POP
+    return Op.PROTO + lists + Op.EMPTY_DICT + Op.text("n_quantiles") + Op.get(3) + Op.SETITEM + Op.STOP
 
 
 def copies_of_one_array(name: bytes, shared: tuple[str, ...], size: int, **others: bytes) -> bytes:
@@ -197,6 +215,16 @@ ATTACKS = {
     "noise of forty million bytes": noise_of_bytes,
     "a MultiDiscrete of forty million bytes": choices_of_bytes,
     "nine hundred names of an image": many_images,
+    **{
+        f"one long text many times as {what}": lambda folder, model, field=field, raw=raw: with_fields(
+            model, folder / "x.zip", **{field: pickled(raw())}
+        )
+        for what, field, raw in (
+            ("a schedule", "learning_rate", lambda: one_text_as(_CONSTANT_SCHEDULE, "val", 300)),
+            ("the mean of noise", "action_noise", lambda: one_text_as(_NORMAL, "_mu", 5000, _sigma=Op.integer(1))),
+            ("n_quantiles", "policy_kwargs", quantiles_of_texts),
+        )
+    },
     "a thousand MultiDiscretes of one array": lambda folder, model: with_fields(
         model, folder / "x.zip", observation_space=pickled(choices_of_one_array())
     ),
