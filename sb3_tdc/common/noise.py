@@ -44,7 +44,7 @@ class VectorizedNormalNoise(VectorizedActionNoise):
         self.base_noise = base_noise
         ends = [getattr(base_noise, name, base_noise._sigma) for name in ("smallest", "largest")]
         mean, smallest, largest = np.broadcast_arrays(base_noise._mu, *ends)
-        self.mean = np.stack([mean] * self.n_envs).astype(float)
+        self.mean = np.array(np.broadcast_to(mean, (self.n_envs, *mean.shape)), dtype=float)
         self.sigma = np.linspace(smallest, largest, self.n_envs)
 
     def __call__(self) -> np.ndarray:

@@ -8,7 +8,9 @@ import warnings
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.her import HerReplayBuffer
@@ -16,6 +18,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_tdc.algorithms import ALGORITHMS
 from sb3_tdc.common.saved_fields import SavedField
 from sb3_tdc.common.untrusted import shown
+from sb3_tdc.common.words import count
 from sb3_tdc.hyperparams import POLICY_ARGUMENTS, constructor_hints
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.inert_pickle import Call, Name, Rebuild, code_in, read_pickle
@@ -221,15 +224,36 @@ def is_her(fields: dict[str, Any]) -> bool:
     return isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
 
 
+def check_noise(fields: dict[str, Any], budget: Budget) -> None:
+    """
+    Check the action noise of a file, which a model copies for each of its environments.
+
+    :raises UnsafeFileError: if the noise is not of the actions, or if the copies take more memory than the budget has
+    """
+    noise, n_actions = fields["action_noise"], math.prod(fields["action_space"].shape)
+    parts = vars(noise).values() if isinstance(noise, ActionNoise) else ()
+    arrays = [part for part in parts if isinstance(part, np.ndarray)]
+    with reading("the field action_noise (custom_objects can replace it)"):
+        size = math.prod(np.broadcast_shapes(*(part.shape for part in arrays)))
+        if size not in (1, n_actions):
+            raise UnsafeFileError(f"noise of {count(size, 'number')} for {count(n_actions, 'action')}")
+        # A number becomes a mean and a standard deviation of every action
+        n_bytes = 0 if noise is None else np.dtype(float).itemsize * max(len(arrays), 2) * n_actions
+        budget.take_bytes(fields.get("n_envs", 1) * n_bytes)
+
+
 def check_replay_memory(fields: dict[str, Any]) -> None:
-    size, observations = fields.get("buffer_size", 1), fields["observation_space"]
+    # SB3 makes room for at least one transition of each environment
+    size = max(fields.get("buffer_size", 1), fields.get("n_envs", 1))
+    observations, actions = fields["observation_space"], fields["action_space"]
     if is_her(fields) and size > MAX_HER_SLOTS:  # it allocates a dict for each transition
         raise UnsafeFileError(
             f"its HerReplayBuffer of {size:,} transitions takes more memory than it should: give a smaller buffer_size"
         )
     parts: Any = observations.spaces.values() if isinstance(observations, spaces.Dict) else [observations]
-    n_bytes = size * sum(2 * math.prod(part.shape) * part.dtype.itemsize for part in parts)
+    n_bytes = size * sum(math.prod(part.shape) * part.dtype.itemsize for part in (*parts, *parts, actions))
     if n_bytes > MAX_REPLAY_BYTES:
         raise UnsafeFileError(
-            f"its replay buffer of {size:,} transitions takes {n_bytes / 2**30:,.0f} GiB: give a smaller buffer_size"
+            f"its replay buffer of {size:,} transitions takes {n_bytes / 2**30:,.0f} GiB: "
+            "give a smaller buffer_size or n_envs"
         )

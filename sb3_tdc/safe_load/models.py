@@ -15,6 +15,7 @@ from sb3_tdc.safe_load.archives import MAX_BYTES, MODEL_ENTRIES, read_archive
 from sb3_tdc.safe_load.budget import Budget, UnsafeFileError
 from sb3_tdc.safe_load.fields import (
     TEMPERATURE,
+    check_noise,
     check_replay_memory,
     foreign_names,
     parse_data,
@@ -80,6 +81,8 @@ def load_safely(
             if name not in fields:
                 raise UnsafeFileError(f"it has no {name}: give env")
         check_replay_memory(fields)
+        if "action_noise" not in given:
+            check_noise(fields, budget)
         check_weights(policy_class, fields, tensors["policy"], budget)
         return _make_model(algorithm, policy_class, env, device, fields, tensors, new_temperature)
 

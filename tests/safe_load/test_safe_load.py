@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 from stable_baselines3 import DDPG, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import GoalSelectionStrategy
@@ -372,6 +373,29 @@ def test_what_is_no_number_is_named_by_its_type(name, args, state, message):
     module, kind = f"stable_baselines3.common.{name}".rsplit(".", 1)
     with pytest.raises(ValueError, match=message):
         Rebuild(CLASSES, CALLS, Budget(0))(Call(Name(module, kind), args, state))
+
+
+def test_what_a_model_makes_for_each_environment_is_paid_for(saved, tmp_path):
+    many = {"n_envs": 10_000, "action_space": serialized(gym.spaces.Box(-1, 1, (2000,)))}
+    path = with_fields(saved, tmp_path / "x.zip", **many, action_noise=0.1)  # two numbers of 8 bytes: 305 MiB
+    assert "the field action_noise (custom_objects can replace it): it would take far more memory" in refuse(path)
+    assert "policy.pth: actor" in refuse(with_fields(path, tmp_path / "y.zip", n_envs=5_000))
+    assert "policy.pth: actor" in refuse(with_fields(path, tmp_path / "y.zip", action_noise=None))
+    large = serialized(gym.spaces.Box(-1, 1, (10**6,)))
+    path = with_fields(saved, path, n_envs=10_000, buffer_size=1, observation_space=large)
+    assert "its replay buffer of 10,000 transitions takes 75 GiB" in refuse(path)  # twice 4 MB for each
+
+
+@pytest.mark.parametrize(("size", "opens"), [((), True), (1, True), (6, True), (2, False), (12, False)])
+def test_noise_is_of_one_number_or_of_the_actions(tmp_path, size, opens):
+    env = make_vec_env("HalfCheetah-v5", 2)  # of 6 actions
+    TDC("MlpPolicy", env, policy_kwargs={"net_arch": [4], "n_quantiles": 2}, **TINY).save(tmp_path / "model.zip")
+    action_noise = serialized(NormalActionNoise(np.zeros(size), np.full(size, 0.1)))
+    path = with_fields(tmp_path / "model.zip", tmp_path / "x.zip", action_noise=action_noise)
+    if opens:
+        assert load_safely(path, device="cpu").action_noise().shape[0] == 2
+    else:
+        assert f"noise of {size} numbers for 6 actions" in refuse(path)
 
 
 def test_a_smaller_buffer_than_the_files(saved, tmp_path):

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 import os
 
 from stable_baselines3 import TD3
@@ -145,6 +146,13 @@ def noise_of_one_array(size: int = 10**5) -> bytes:
     return copies_of_one_array(_ORNSTEIN_UHLENBECK, ("_mu", "_sigma"), size, **numbers, initial_noise=Op.NONE)
 
 
+def noise_of_other_actions(mean: tuple[int, ...], sigma: tuple[int, ...], n_envs: int):
+    """Return a ``make`` for a model of many environments, whose noise has a mean and a sigma of these shapes."""
+    parts = {name: array(b"\1" * math.prod(shape), "u1", *shape) for name, shape in (("_mu", mean), ("_sigma", sigma))}
+    raw = Op.PROTO + with_state(_NORMAL, **parts) + Op.STOP
+    return lambda folder, model: with_fields(model, folder / "x.zip", action_noise=pickled(raw), n_envs=n_envs)
+
+
 def images_of_many_names(n: int = 900) -> bytes:
     """One image under many names: a network is built for every name."""
     size = (1, 36, 36)
@@ -214,6 +222,8 @@ ATTACKS = {
     ),
     "noise of forty million bytes": noise_of_bytes,
     "a MultiDiscrete of forty million bytes": choices_of_bytes,
+    "noise of four thousand actions in ten thousand environments": noise_of_other_actions((4000,), (4000,), 10_000),
+    "noise that broadcasts to four million actions": noise_of_other_actions((2000, 1), (1, 2000), 8),
     "nine hundred names of an image": many_images,
     **{
         f"one long text many times as {what}": lambda folder, model, field=field, raw=raw: with_fields(
