@@ -114,6 +114,10 @@ def _arrays_like(buffer: ReplayBuffer) -> Callable[[Call, Rebuild], dict[str, An
     names = [name for name, value in vars(buffer).items() if isinstance(value, dict) or _is_numeric(value)]
 
     def read_state(call: Call, make: Rebuild) -> dict[str, Any]:
+        for name in ("optimize_memory_usage", "handle_timeout_termination"):  # what a sample is made of depends on them
+            saved, of_run = boolean(name, call.state[name]), getattr(buffer, name)
+            if saved is not of_run:
+                raise UnsafeFileError(f"it was saved with {name}={saved}, this run has {of_run}")
         position = {"pos": integer(0)("pos", make(call.state["pos"])), "full": boolean("full", call.state["full"])}
         n_envs = integer(1, MAX_ENVS)("n_envs", make(call.state["n_envs"]))
         arrays = {name: make(call.state[name]) for name in names}

@@ -788,6 +788,23 @@ def test_infos_of_hindsight_are_those_of_sb3(tmp_path, marker):
     assert not marker.exists()
 
 
+@pytest.mark.parametrize("name", ["optimize_memory_usage", "handle_timeout_termination"])
+def test_a_replay_buffer_that_samples_otherwise_is_refused(tmp_path, name):
+    def learned(value):
+        both = {"optimize_memory_usage": False, "handle_timeout_termination": False, name: value}
+        of_buffer = {"handle_timeout_termination": both.pop("handle_timeout_termination")}
+        return pendulum(TDC, n=20, replay_buffer_kwargs=of_buffer, **both)
+
+    for saved, of_run in ((True, False), (False, True)):
+        learned(saved).save_replay_buffer(tmp_path / "buffer.pkl")
+        model = learned(of_run)
+        before = model.replay_buffer.observations.copy()
+        with pytest.raises(UnsafeFileError, match=f"it was saved with {name}={saved}, this run has {of_run}$"):
+            load_replay_buffer(tmp_path / "buffer.pkl", model)
+        np.testing.assert_array_equal(model.replay_buffer.observations, before)
+    load_replay_buffer(tmp_path / "buffer.pkl", learned(saved))
+
+
 def test_infos_of_tens_of_thousands_of_transitions_are_not_too_many(tmp_path):
     model = weighted(buffer_size=50_000)
     for i in range(50_000):
