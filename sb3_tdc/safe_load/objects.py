@@ -1,5 +1,6 @@
 """Safe readers for the pickles saved next to a model: ``VecNormalize`` statistics and replay buffers."""
 
+import math
 import mmap
 from collections.abc import Callable
 from pathlib import Path
@@ -98,7 +99,9 @@ def _normalization_state(call: Call, make: Rebuild) -> dict[str, Any]:
     for name in ("training", "norm_obs", "norm_reward"):
         fields[name] = boolean(name, make(state[name]))
     for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
-        fields[name] = number(0.0)(name, make(state[name]))
+        value = make(state[name])
+        is_no_clipping = name.startswith("clip") and isinstance(value, float) and value == math.inf
+        fields[name] = value if is_no_clipping else number(0.0)(name, value)
     keys = make(state.get("norm_obs_keys"))
     if keys is not None and not (isinstance(keys, list) and all(isinstance(key, str) for key in keys)):
         raise UnsafeFileError("norm_obs_keys that are not names")

@@ -704,6 +704,19 @@ def test_normalisation_is_that_of_sb3(tmp_path, marker):
     assert not marker.exists()
 
 
+@pytest.mark.parametrize("name", ["clip_obs", "clip_reward"])
+def test_normalisation_without_clipping(tmp_path, name):
+    env = VecNormalize(make_vec_env("Pendulum-v1"), **{name: np.inf})
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    assert getattr(load_normalization(tmp_path / "vecnormalize.pkl", env.venv), name) == np.inf
+    for field, value in ((name, np.nan), (name, -np.inf), ("epsilon", np.inf)):
+        poisoned = VecNormalize(env.venv)
+        setattr(poisoned, field, value)
+        poisoned.save(str(tmp_path / "poisoned.pkl"))
+        with pytest.raises(UnsafeFileError, match=f"{field} must be a finite number"):
+            load_normalization(tmp_path / "poisoned.pkl", env.venv)
+
+
 @pytest.mark.parametrize("name", ["tdc", "tdc-stochastic", "tdc-dict", "tdc-her"])
 def test_a_replay_buffer_is_that_of_sb3(tmp_path, marker, name):
     model = MODELS[name]()
