@@ -26,7 +26,7 @@ from sb3_tdc.common.saved_fields import (
 from sb3_tdc.common.untrusted import shown
 from sb3_tdc.safe_load.reading import is_plain
 
-MAX_ENVS = 10_000
+MAX_ENVS = 65_536
 MAX_CRITICS = 256  # all critics are built before their weights are compared
 
 
@@ -109,7 +109,7 @@ OFF_POLICY = {
         _total_timesteps=integer(0),
         _num_timesteps_at_start=integer(0),
         _stats_window_size=integer(0),
-        _current_progress_remaining=number(-1.0, 1.0),
+        _current_progress_remaining=number(maximum=1.0),  # below 0 if a rollout ends long after the last step
     ),
 }
 _N_CRITICS = {"policy_kwargs.n_critics": SavedField(integer(1, MAX_CRITICS), is_required=False)}

@@ -216,6 +216,14 @@ def test_the_folder_of_logs_is_not_the_files(saved, tmp_path):
     assert load_safely(path, device="cpu").tensorboard_log is None
 
 
+def test_a_model_of_very_many_environments(saved, tmp_path):
+    # One rollout of 16,384 steps where 5,000 were asked for: 1 - 16,384 / 5,000 is left
+    path = with_fields(saved, tmp_path / "x.zip", n_envs=16_384, _current_progress_remaining=-2.2768)
+    opened = load_safely(path, device="cpu")
+    assert opened.n_envs == 16_384
+    assert opened.action_noise().shape == (16_384, 1)
+
+
 # -------------------------------------------------------------------- what does not run
 
 
@@ -297,7 +305,7 @@ def test_odd_values_give_one_sentence(saved, tmp_path, value):
         ({"policy_kwargs": {"net_arch": [8, 8], "features_extractor_class": "os.system"}}, "policy_kwargs"),
         ({"policy_kwargs": {"net_arch": [8, 8], "surprise": 1}}, "unknown key 'surprise'"),
         ({"buffer_size": 10**12}, "give a smaller buffer_size"),
-        ({"n_envs": 10**9}, "n_envs must be an integer from 1 to 10,000"),
+        ({"n_envs": 10**9}, "n_envs must be an integer from 1 to 65,536"),
         ({"policy_class": "sb3_tdc.tdc.policies.TDCPolicy"}, "policy_class"),
         ({"replay_buffer_class": serialized(TDC)}, "replay_buffer_class"),
         ({"unknown": 1}, "'unknown' is unknown"),
