@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_tdc.algorithms import ALGORITHMS
@@ -70,13 +69,16 @@ _MADE_ANEW = {
 
 
 def read_fields(
-    raw: bytes, custom_objects: dict[str, Any], budget: Budget, algorithm: type[OffPolicyAlgorithm] | None = None
+    data: dict[str, Any],
+    custom_objects: dict[str, Any],
+    budget: Budget,
+    algorithm: type[OffPolicyAlgorithm] | None = None,
 ) -> tuple[dict[str, Any], type[OffPolicyAlgorithm]]:
     """
     Read the fields of a saved model.
 
-    :param raw: the entry ``data``
-    :param custom_objects: values by field name that replace those of the file, which are then not used
+    :param data: the fields as :func:`parse_data` returns them
+    :param custom_objects: values by field name that replace those of the file, which are then not used, or are missing
     :param budget: of the file
     :param algorithm: the algorithm that must have saved the file, or a subclass of it; None for the algorithm of the
         file's policy
@@ -84,7 +86,6 @@ def read_fields(
     :raises UnsafeFileError: if a field is unknown, missing or not allowed (the error names it), or if another algorithm
         saved the file
     """
-    data = parse_data(raw)
     policies = known_policies()
     make = Rebuild({**CLASSES, **{pickled_name(policy): policy for policy in policies}}, CALLS, budget)
     policy_class = custom_objects.get("policy_class")
@@ -98,19 +99,19 @@ def read_fields(
     if not issubclass(algorithm, saved_by):
         raise UnsafeFileError(f"it was saved by {saved_by.__name__}, not by {algorithm.__name__}")
     declared = saved_fields(algorithm)
-    fields = {}
+    fields = {name: value for name, value in custom_objects.items() if name in data or name in declared}
     for name, value in data.items():
-        if name in custom_objects:
-            fields[name] = custom_objects[name]
-        elif name in declared:
+        if name in fields:
+            continue
+        if name in declared:
             fields[name] = _read_field(name, value, declared[name], make)
         elif name not in _MADE_ANEW:
             raise UnsafeFileError(f"the field {shown(name)} is unknown (custom_objects can replace it)")
     _warn_of_code(data, custom_objects, budget)
     fields.setdefault("policy_kwargs", {}).pop("device", None)
-    _check_policy_arguments(fields["policy_kwargs"], fields.get("policy_class", BasePolicy), declared)
+    _check_policy_arguments(fields["policy_kwargs"], policy_class, declared)
     for name, field in declared.items():
-        if field.is_required and name not in {**fields, **custom_objects}:
+        if field.is_required and name not in fields:
             raise UnsafeFileError(f"the field {name} is missing (custom_objects can give it)")
     return fields, algorithm
 

@@ -59,12 +59,11 @@ def load_safely(
     with reading(f"{path} was not opened"):
         entries, budget = _read_entries(path)
         given = {**kwargs, **(custom_objects or {})}
-        of_the_caller = {name: value for name, value in given.items() if name != "ent_coef"}
-        fields, algorithm = read_fields(entries["data"], of_the_caller, budget, algorithm)
-        policy_class: Any = fields.get("policy_class")
-        new_temperature = "ent_coef" in given and given["ent_coef"] != fields.get("ent_coef")
-        fields.update({name: given[name] for name in (*kwargs, "ent_coef") if name in given})
-        del fields["policy_class"]
+        data = parse_data(entries["data"])
+        fields, algorithm = read_fields(data, given, budget, algorithm)
+        new_temperature = "ent_coef" in given and given["ent_coef"] != data.get("ent_coef")
+        fields.update({name: given[name] for name in kwargs})
+        policy_class: Any = fields.pop("policy_class")
         tensors = {}
         for name in (name for name in entries if name.endswith(".pth")):
             with reading(name):
@@ -95,7 +94,7 @@ def read_model_fields(path: Path, algorithm: type[OffPolicyAlgorithm] | None = N
     """
     with reading(f"{path} was not opened"):
         entries, budget = _read_entries(path)
-        fields, _ = read_fields(entries["data"], {}, budget, algorithm)
+        fields, _ = read_fields(parse_data(entries["data"]), {}, budget, algorithm)
         return fields
 
 

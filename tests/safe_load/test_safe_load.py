@@ -44,6 +44,7 @@ from sb3_tdc.safe_load.fields import foreign_names, saved_fields
 from sb3_tdc.safe_load.inert_pickle import Call, Name, Rebuild, read_pickle
 from sb3_tdc.safe_load.known_objects import CALLS, CLASSES
 from sb3_tdc.safe_load.models import names_code
+from sb3_tdc.tdc.policies import TDCPolicy
 from tests.helpers.command_line import SMALL, run_enjoy, run_train
 from tests.helpers.saved_models import HER, MODELS, TINY, frames, goal_env, noise, pendulum
 from tests.safe_load.attacks.data import layers
@@ -1193,6 +1194,21 @@ def test_every_field_that_is_required_is_written_by_sb3_and_refused_without(tmp_
 def test_plain_quantile_regression_opens(tmp_path):
     pendulum(TDC, kappa=0.0).save(tmp_path / "model.zip")
     assert load_safely(tmp_path / "model.zip", device="cpu").kappa == 0
+
+
+def without(source, target, name):
+    return rewrite(source, target, data=json.dumps({k: v for k, v in fields_of(source).items() if k != name}))
+
+
+@pytest.mark.parametrize(("name", "value"), [("gamma", 0.5), ("ent_coef", 0.25), ("policy_class", TDCPolicy)])
+def test_custom_objects_give_a_field_that_is_missing(saved, tmp_path, name, value):
+    path = without(saved, tmp_path / "x.zip", name)
+    opened = load_safely(path, device="cpu", custom_objects={name: value, "clip_range": 0.2})
+    assert getattr(opened, name) == value
+    assert not hasattr(opened, "clip_range")  # as SB3's load ignores what is a field of other algorithms
+    if name == "ent_coef":
+        assert opened.log_ent_coef is None
+        assert opened.ent_coef_tensor.item() == 0.25
 
 
 def test_a_field_of_another_algorithm_is_unknown(tmp_path):
