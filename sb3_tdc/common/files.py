@@ -100,9 +100,9 @@ def numbered(parent: Path, name: str) -> dict[int, Path]:
 
 def lock(path: Path) -> Any:
     """
-    Lock a file until it is closed; create it if it does not exist. On Windows the file is opened, but not locked.
+    Lock a file until it is closed; create it if it does not exist.
 
-    Nothing is locked on Windows, or by a file system without locks, of which a warning tells.
+    On Windows the file is opened, but not locked; likewise, with a warning, on a file system that has no locks.
 
     :return: the open file; None if another process has locked it
     """
