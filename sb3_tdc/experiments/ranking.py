@@ -73,8 +73,8 @@ def write_results(folder: Path, candidates: Sequence[Sequence[Job]], searched: S
     table = rank(candidates, searched)
     table.to_csv(folder / "ranking.csv", index=False)
     print(table.to_string(index=False, float_format=lambda x: f"{x:g}", na_rep="–"))
+    evaluated = [candidates[number] for number in sorted(table.index[table["steps"] > 0])]
     for key in searched:
-        evaluated = [jobs for jobs in candidates if len(read_shared_evaluations(jobs)[0])]
         numbers = [jobs for jobs in evaluated if type(jobs[0].settings[key]) in (int, float)]
         if len({jobs[0].settings[key] for jobs in numbers}) > 1:
             draw(numbers, key, folder / key)
