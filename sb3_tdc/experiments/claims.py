@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_tdc.experiments import statistics
-from sb3_tdc.experiments.groups import Group, as_shipped, by_conditions, is_as_shipped, vary
+from sb3_tdc.experiments.groups import EVALUATION, Group, as_shipped, by_conditions, is_as_shipped, vary
 from sb3_tdc.experiments.results import Run
 from sb3_tdc.experiments.suites import MUJOCO, PYBULLET
 
@@ -200,7 +200,7 @@ def _variances(groups: Sequence[Group]) -> Iterator[Claim]:
     for plain, baseline in _baselines(group for group in groups if group.env_id in MUJOCO):
         yield _claim("2. λ-LCB varies less", _SEEDS, plain, baseline, judge_spread)
         # The scatter depends on the interval between evaluations and on the episodes in each
-        if all(plain.setting(key) == baseline.setting(key) for key in ("eval_freq", "eval_episodes")):
+        if all(plain.setting(key) == baseline.setting(key) for key in EVALUATION):
             yield _claim("2. λ-LCB varies less", _LATE_SPREAD, plain, baseline, judge_smaller)
 
 
