@@ -28,11 +28,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tdc.advb import BoardCallback
 from sb3_tdc.advb.algorithms import Advised
+from sb3_tdc.common.exceptions import describe_exception
 from sb3_tdc.common.files import make_numbered, write_atomically
 from sb3_tdc.common.finite import NonFiniteError
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm
 from sb3_tdc.common.words import listed
-from sb3_tdc.envs.checked import EnvironmentFaultError, describe_exception
+from sb3_tdc.envs.checked import EnvironmentFaultError
 from sb3_tdc.envs.make import SETUP_ERRORS, make_envs
 from sb3_tdc.envs.processes import closing_envs, ended_processes
 from sb3_tdc.envs.registry import simulator_of
