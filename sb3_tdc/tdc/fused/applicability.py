@@ -24,7 +24,8 @@ from sb3_tdc.tdc.policies import (
     TDCPolicy,
 )
 
-th.optim.Adam([nn.Parameter(th.zeros(1))])  # the first optimizer of a class wraps the class's step
+# The first optimizer of a class wraps the class's step. To make a whole one would import torch._dynamo: a second
+th.optim.Adam._patch_step_function(th.optim.Adam.__new__(th.optim.Adam))
 
 _DENSITY = ("proba_distribution", "log_prob", "sample", "mode")
 # Methods whose work the fused update does itself, as they were when this module was imported: class → name → function
