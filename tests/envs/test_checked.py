@@ -1,6 +1,5 @@
 """Environments that fail in every way: in this process, in a subprocess, and while they are made."""
 
-import multiprocessing
 import os
 import sys
 import threading
@@ -215,7 +214,6 @@ def test_an_environment_that_cannot_be_made_in_its_process_is_named(processes, c
     [(lambda: os._exit(0), "ended with exit status 0"), (lambda: os.kill(os.getpid(), 9), "was ended by SIGKILL")],
 )
 def test_a_process_that_ends_is_named_with_how(processes, end, sentence):
-    multiprocessing.set_forkserver_preload(["sb3_tdc.envs.checked"])
     env = processes(lambda: Answers(end), "forkserver")
     env.reset()
     with pytest.raises(EnvironmentFaultError, match=f"the process of environment 1 {sentence}"):
@@ -229,7 +227,6 @@ def test_a_process_that_ends_is_named_with_how(processes, end, sentence):
 @pytest.mark.parametrize("dying", [0, 2])
 def test_environments_are_closed_after_the_death_of_any_process(dying):
     """The answers of the others to the same step may not have been received."""
-    multiprocessing.set_forkserver_preload(["sb3_tdc.envs.checked"])
     ends = [lambda: GOOD] * 3
     ends[dying] = lambda: os.kill(os.getpid(), 9)
     env = CheckedSubprocVecEnv([partial(CheckedEnv, Answers(end)) for end in ends], "forkserver")

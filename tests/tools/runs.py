@@ -6,6 +6,7 @@ Small runs that are stopped and resumed, and fingerprints of everything that the
 
 import hashlib
 import json
+import multiprocessing
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -387,5 +388,6 @@ def main(mode: str, folder: Path, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    multiprocessing.set_forkserver_preload(["tests.tools.runs"])  # imported once for all processes of environments
     calibration.PERIOD = 20  # so that λ moves within the few steps of a case
     main(sys.argv[1], Path(sys.argv[2]), sys.argv[3:])
