@@ -5,7 +5,6 @@ Signals to its group, a full disk, removed folders, edited files, clocks that ar
 """
 
 import errno
-import multiprocessing
 import os
 import shutil
 import signal
@@ -26,6 +25,7 @@ from sb3_tdc.resume import ResumeCallback, stored_steps
 from sb3_tdc.runs.callbacks.progress import ProgressCallback
 from sb3_tdc.runs.callbacks.stopping import StopOnSignalCallback, StoppableEvaluation
 from sb3_tdc.safe_load import load_normalization
+from tests.helpers import failing_envs  # noqa: F401, since it registers them
 from tests.helpers.command_line import SMALL_ANY
 from tests.helpers.paths import ROOT
 from tests.helpers.training import fails, outcome, resume, run_train
@@ -38,7 +38,9 @@ def no_space(*args, **kwargs):
 # ---------------------------------------------------------------- signals
 
 
-@pytest.mark.parametrize(("number", "times"), [(signal.SIGTERM, 3), (signal.SIGHUP, 1)])
+@pytest.mark.parametrize(
+    ("number", "times"), [(signal.SIGTERM, 3), pytest.param(signal.SIGHUP, 1, marks=pytest.mark.slow)]
+)
 def test_a_signal_to_the_whole_group_loses_nothing_of_a_run_with_processes(tmp_path, number, times):
     command = [sys.executable, "-W", "ignore", str(ROOT / "train.py"), "--env", "Pendulum-v1", "--vec-env", "subproc"]
     command += ["-n", "100000", "-f", str(tmp_path), "--eval-freq", "300", "--resume-freq", "50000"]
@@ -89,32 +91,18 @@ def test_a_second_ctrl_c_interrupts_and_a_second_sigterm_does_not(monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
 
 
-class Dies(PendulumEnv):
-    """An environment that cannot be made in the second process."""
-
-    def __init__(self):
-        super().__init__()
-        if multiprocessing.current_process().name.endswith("2"):
-            raise RuntimeError("no licence")
+def train_in_process(env_id, *options):
+    """Train on environments that have processes of their own."""
+    command = [sys.executable, "-W", "ignore", ROOT / "train.py", "--env", env_id, "--vec-env", "subproc"]
+    command += ["--gym-packages", "tests.helpers.failing_envs", *options]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, timeout=90, env=environment, check=False
+    )
 
 
 def test_processes_that_ignore_signals_do_not_outlive_a_run_that_fails(tmp_path):
-    code = "import gymnasium, sys; from tests.resume.test_survival import Dies; from sb3_tdc.cli.train import main\n"
-    code += "gymnasium.register('Dies-v0', Dies)\nif __name__ == '__main__': sys.exit(main())"
-    (tmp_path / "code.py").write_text(code)
-    command = [
-        sys.executable,
-        "-W",
-        "ignore",
-        str(tmp_path / "code.py"),
-        "--env",
-        "Dies-v0",
-        "-f",
-        str(tmp_path / "logs"),
-    ]
-    command += ["--gym-packages", "tests.resume.test_survival", "--vec-env", "subproc", "-params", "n_envs:2"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, check=False)
+    ended = train_in_process("Dies-v0", "-f", tmp_path / "logs", "-params", "n_envs:2")
     assert ended.returncode == 2
     assert "Dies-v0 cannot be made: RuntimeError: no licence (" in ended.stderr
     assert "Traceback" not in ended.stderr
@@ -330,42 +318,6 @@ def test_a_clock_that_was_set_back_does_not_fold_the_curve(tmp_path, stop_at, mo
 # ---------------------------------------------------------------- environments that fail
 
 
-class Raises(PendulumEnv):
-    """:param how: what goes wrong from step ``at`` of this environment on; "reset": at every reset"""
-
-    def __init__(self, how="raise", at=250):
-        super().__init__()
-        self.how, self.at, self.count = how, at, 0
-
-    def reset(self, **kwargs):
-        if self.how == "reset":
-            raise RuntimeError("no scene\nto load")
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        self.count += 1
-        observation, reward, *rest = super().step(action)
-        if self.count < self.at:
-            return observation, reward, *rest
-        if self.how == "raise":
-            raise ZeroDivisionError("in the\nsimulator")
-        if self.how == "die":
-            os._exit(3)
-        if self.how == "killed":
-            os.kill(os.getpid(), signal.SIGKILL)
-        return {
-            "shape": (np.zeros(5), reward, *rest),
-            "type": (np.array(["a", "b", "c"]), reward, *rest),
-            "none": None,
-            "no observation": (None, reward, *rest),
-            "no reward": (observation, None, *rest),
-            "four": (observation, reward, False, {}),
-        }[self.how]
-
-
-gym.register("Raises-v0", Raises, max_episode_steps=100)
-
-
 @pytest.mark.parametrize(
     ("how", "reason"),
     [
@@ -407,13 +359,8 @@ def test_an_environment_that_fails_is_one_sentence_and_the_run_can_be_resumed(tm
     ],
 )
 def test_a_process_of_an_environment_that_fails_is_named(tmp_path, how, arguments, reason):
-    code = "import sys; import tests.resume.test_survival; from sb3_tdc.cli.train import main\n"
-    (tmp_path / "code.py").write_text(f"{code}if __name__ == '__main__': sys.exit(main())")
-    command = [sys.executable, "-W", "ignore", str(tmp_path / "code.py"), "--env", "Raises-v0", "-n", "400"]
-    command += ["-f", str(tmp_path), "--env-kwargs", f"how:{how}", "at:60", "--vec-env", "subproc"]
-    command += ["--resume-freq", "40", "-params", "n_envs:2", "learning_starts:1000", *arguments.split()]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=90, env=environment, check=False)
+    options = f"-n 400 --resume-freq 40 --env-kwargs how:{how} at:60 {arguments}".split()
+    ended = train_in_process("Raises-v0", "-f", tmp_path, *options, "-params", "n_envs:2", "learning_starts:1000")
     assert ended.returncode == 1
     assert f"Training failed at {reason}" in ended.stderr
     assert "Traceback" not in ended.stderr
