@@ -413,8 +413,7 @@ def test_recording_without_a_display(tmp_path, capsys, monkeypatch):
     assert np.abs(frames[-1].astype(float) - frames[0]).mean() > 0.1  # it moves
 
 
-@pytest.mark.parametrize("send", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+@pytest.mark.parametrize(("send", "vec_env"), [(signal.SIGINT, "subproc"), (signal.SIGTERM, "dummy")])
 def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
     """A Ctrl-C reaches the whole process group, as in a terminal."""
     options = ["-f", tmp_path, "--eval-freq", "-1", "--vec-env", vec_env, *SMALL, "n_envs:2"]

@@ -54,22 +54,25 @@ def test_glfw_without_a_display_is_said_to_be_none(monkeypatch):
         rendering.choose_gl_backend()
 
 
+def train_without_opengl(env_id, folder, *options):
+    """In a subprocess, since a process imports MuJoCo only once."""
+    command = [sys.executable, "-m", "sb3_tdc", "train", "--env", env_id, "-f", folder, "-n", 50, "--eval-freq", -1]
+    command += ["--verbose", 0, "--device", "cpu", *options]
+    environment = {**os.environ, "MUJOCO_GL": "nothing", "PYTHONPATH": str(ROOT)}
+    return subprocess.run(list(map(str, command)), env=environment, capture_output=True, text=True)
+
+
 @pytest.mark.parametrize("options", [[], ["--vec-env", "gymnasium"], ["--vec-env", "subproc"]])
 def test_an_opengl_that_cannot_be_imported_is_a_sentence(tmp_path, options):
-    """In a subprocess, since a process imports MuJoCo only once."""
-    arguments = ["-f", tmp_path, "-n", 50, "--eval-freq", -1, "--verbose", 0, "--device", "cpu", *options]
-
-    def train_on(env_id):
-        command = [sys.executable, "-m", "sb3_tdc", "train", "--env", env_id, *map(str, arguments)]
-        environment = {**os.environ, "MUJOCO_GL": "nothing", "PYTHONPATH": str(ROOT)}
-        return subprocess.run(command, env=environment, capture_output=True, text=True)
-
-    ended = train_on("Hopper-v4")
+    ended = train_without_opengl("Hopper-v4", tmp_path, *options)
     assert ended.returncode == 2
     assert "error: MuJoCo cannot be imported with MUJOCO_GL=nothing (from the environment): unset it" in ended.stderr
     assert "Traceback" not in ended.stderr
     assert list(tmp_path.iterdir()) == []
-    assert train_on("Pendulum-v1").returncode == 0  # needs no OpenGL
+
+
+def test_what_is_not_of_mujoco_needs_no_opengl(tmp_path):
+    assert train_without_opengl("Pendulum-v1", tmp_path, "--vec-env", "subproc").returncode == 0
 
 
 # ---------------------------------------------------------------- environments of all kinds
