@@ -10,7 +10,7 @@ from tests.helpers.searches import arguments, start_search
 
 
 def test_from_a_search_to_a_page(tmp_path, capsys):
-    options = arguments(tmp_path, steps=100)
+    options = [*arguments(tmp_path, steps=100), "--seeds", 1]
     out, status = finish(start_search(*options, "--search", "lam:[0.0, 1.0]"))
     assert status == 0, out
     search = tmp_path / "search/tdc/Pendulum-v1_1"
