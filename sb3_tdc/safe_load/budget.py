@@ -4,7 +4,7 @@ import time
 
 MAX_OPCODES = 1_000_000  # SB3 writes a few thousand for a model
 MAX_NODES = 500_000  # values, each counted as often as it is reached; infos with that many use about MAX_OPCODES
-MAX_SECONDS = 4.0  # in addition to the time for the bytes of the file
+MAX_SECONDS = 4.0  # of the thread's processor time, in addition to the time for the bytes of the file
 BYTES = 2**28  # that are granted to every file, however small
 GROWTH = 8  # further bytes for each byte of the file: its entries, copies, arrays
 BYTES_PER_SECOND = 2**25
@@ -16,7 +16,7 @@ class UnsafeFileError(ValueError):
 
 class Budget:
     """
-    Budget of one file, created when the file is opened and passed to everything that reads from it.
+    Budget of one file, created when the file is opened and passed to everything that reads from it, in one thread.
 
     :param size: size of the file in bytes
     """
@@ -24,7 +24,7 @@ class Budget:
     def __init__(self, size: int):
         self.opcodes, self.nodes = MAX_OPCODES, MAX_NODES
         self.bytes = BYTES + GROWTH * size
-        self.deadline = time.monotonic() + MAX_SECONDS + size / BYTES_PER_SECOND
+        self.deadline = time.thread_time() + MAX_SECONDS + size / BYTES_PER_SECOND
 
     def take_opcode(self) -> None:
         """
@@ -65,5 +65,5 @@ class Budget:
 
         :raises UnsafeFileError: if reading has taken too long
         """
-        if time.monotonic() > self.deadline:
+        if time.thread_time() > self.deadline:
             raise UnsafeFileError("it takes too long to read")

@@ -1,5 +1,6 @@
 """Safe reader for saved models."""
 
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sb3_tdc.safe_load.fields import (
     check_noise,
     check_replay_memory,
     foreign_names,
+    known_policies,
     parse_data,
     read_fields,
 )
@@ -100,6 +102,9 @@ def read_model_fields(path: Path, algorithm: type[OffPolicyAlgorithm] | None = N
 
 def _read_entries(path: Path) -> tuple[dict[str, bytes], Budget]:
     """Return the entries of a saved model, and the budget for what is read from them."""
+    # What building a model imports, which takes seconds where Python has not compiled it yet, is not the file's cost
+    known_policies()
+    importlib.import_module("torch._dynamo")  # by PyTorch's first optimizer
     with open_regular(path, MAX_BYTES) as (file, size):
         budget = Budget(size)
         entries = read_archive(file, MODEL_ENTRIES, budget)

@@ -10,6 +10,8 @@ import pickle
 import re
 import shutil
 import struct
+import subprocess
+import sys
 import time
 import tracemalloc
 import warnings
@@ -587,6 +589,39 @@ def test_reading_entries_takes_its_time_from_the_budget(saved):
     spent.take_bytes = lambda _: setattr(spent, "deadline", 0.0)  # the time is up once the entries are listed
     with open(saved, "rb") as file, pytest.raises(UnsafeFileError, match="takes too long"):
         read_archive(file, MODEL_ENTRIES, spent)
+
+
+def test_only_processor_time_counts(monkeypatch):
+    """A busy machine does not refuse a file; work on it does."""
+    monkeypatch.setattr(budget, "MAX_SECONDS", 0.2)
+    spent = Budget(0)
+    time.sleep(0.3)
+    spent.check_time()
+    start = time.thread_time()
+    while time.thread_time() - start < 0.3:
+        pass
+    with pytest.raises(UnsafeFileError, match="takes too long"):
+        spent.check_time()
+
+
+def test_a_file_does_not_pay_for_imports(saved):
+    """Where Python has not compiled them yet, they take longer than any file may."""
+    code = f"""
+import sys
+from sb3_tdc import load_safely
+from sb3_tdc.safe_load import budget
+class Noted(budget.Budget):
+    def __init__(self, size):
+        self.modules = set(sys.modules)
+        super().__init__(size)
+        noted.append(self)
+noted = []
+sys.modules["sb3_tdc.safe_load.models"].Budget = Noted
+load_safely({str(saved)!r})
+print(len(sys.modules.keys() - noted[0].modules))
+"""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 20  # they were 846
 
 
 def test_entries_are_counted_once(saved, tmp_path):
