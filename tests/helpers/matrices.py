@@ -14,7 +14,7 @@ CODE = f"""
 import sys
 from sb3_tdc.experiments.suites import SUITES, Cell
 from sb3_tdc.cli.matrix import main
-SMALL = {{**{SMALL_TDC}, "env_kwargs": {{"max_episode_steps": 20}}}}  # an evaluation takes a second
+SMALL = {{**{SMALL_TDC}, "env_kwargs": {{"max_episode_steps": 60}}}}  # short evaluations
 SUITES["fig1"] = [Cell("tdc", "Pendulum-v1", SMALL), Cell("tdc", "Pendulum-v1", {{**SMALL, "lam": 0.0}})]
 SUITES["fig2"] = [Cell("tdc", "Pendulum-v1", {{**SMALL, "lam": -1.0}}), Cell("tdc", "Pendulum-v1", SMALL)]
 sys.exit(main())
