@@ -58,6 +58,8 @@ def load_safely(
     path = Path(path)
     if not path.exists() and path.with_name(f"{path.name}.zip").is_file():
         path = path.with_name(f"{path.name}.zip")
+    # The first optimizer imports it, which takes seconds where Python has not compiled it yet: not the file's cost
+    importlib.import_module("torch._dynamo")
     with reading(f"{path} was not opened"):
         entries, budget = _read_entries(path)
         given = {**kwargs, **(custom_objects or {})}
@@ -102,9 +104,7 @@ def read_model_fields(path: Path, algorithm: type[OffPolicyAlgorithm] | None = N
 
 def _read_entries(path: Path) -> tuple[dict[str, bytes], Budget]:
     """Return the entries of a saved model, and the budget for what is read from them."""
-    # What building a model imports, which takes seconds where Python has not compiled it yet, is not the file's cost
-    known_policies()
-    importlib.import_module("torch._dynamo")  # by PyTorch's first optimizer
+    known_policies()  # imports sb3-contrib, which is not the file's cost
     with open_regular(path, MAX_BYTES) as (file, size):
         budget = Budget(size)
         entries = read_archive(file, MODEL_ENTRIES, budget)
