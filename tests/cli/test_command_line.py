@@ -413,7 +413,15 @@ def test_recording_without_a_display(tmp_path, capsys, monkeypatch):
     assert np.abs(frames[-1].astype(float) - frames[0]).mean() > 0.1  # it moves
 
 
-@pytest.mark.parametrize(("send", "vec_env"), [(signal.SIGINT, "subproc"), (signal.SIGTERM, "dummy")])
+@pytest.mark.parametrize(
+    ("send", "vec_env"),
+    [
+        (signal.SIGINT, "subproc"),
+        (signal.SIGTERM, "dummy"),
+        pytest.param(signal.SIGINT, "dummy", marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, "subproc", marks=pytest.mark.slow),
+    ],
+)
 def test_stopping_saves_and_says_how_to_go_on(tmp_path, send, vec_env):
     """A Ctrl-C reaches the whole process group, as in a terminal."""
     options = ["-f", tmp_path, "--eval-freq", "-1", "--vec-env", vec_env, *SMALL, "n_envs:2"]

@@ -78,7 +78,7 @@ def test_a_stream_that_was_closed_from_the_start_stays_away(monkeypatch):
     assert sys.stdout is None
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_signal_saves_although_the_reader_of_the_pipe_is_gone(tmp_path, number):
     """As with ``train.py … 2>&1 | tee log`` and Ctrl-C, which ends ``tee`` first, or a terminal that is closed."""
     reader, writer = os.pipe()

@@ -71,8 +71,11 @@ def test_an_opengl_that_cannot_be_imported_is_a_sentence(tmp_path, options):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_not_of_mujoco_needs_no_opengl(tmp_path):
-    assert train_without_opengl("Pendulum-v1", tmp_path, "--vec-env", "subproc").returncode == 0
+@pytest.mark.parametrize(
+    "vec_env", ["subproc", *(pytest.param(x, marks=pytest.mark.slow) for x in ("dummy", "gymnasium"))]
+)
+def test_what_is_not_of_mujoco_needs_no_opengl(tmp_path, vec_env):
+    assert train_without_opengl("Pendulum-v1", tmp_path, "--vec-env", vec_env).returncode == 0
 
 
 # ---------------------------------------------------------------- environments of all kinds
