@@ -26,7 +26,7 @@ from sb3_tdc.runs.algorithms import KNOWN_ALGORITHMS
 from sb3_tdc.runs.callbacks.finite_guard import check_before_saving
 from sb3_tdc.runs.folder import RunFolder
 from sb3_tdc.safe_load import UnsafeFileError, load_replay_buffer, load_safely, read_data
-from sb3_tdc.safe_load.fields import on_the_command_line
+from sb3_tdc.safe_load.fields import TEMPERATURE, on_the_command_line
 from sb3_tdc.safe_load.models import names_code, read_model_fields
 
 # Raised when the disk is full: by Python and NumPy an OSError, by PyTorch a RuntimeError
@@ -140,11 +140,28 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
     """
     check_saved_by(path, algo)
     if trust:
-        return KNOWN_ALGORITHMS[algo].load(path, env=env, **kwargs)
+        return _load_with_temperature(KNOWN_ALGORITHMS[algo], path, env, **kwargs)
     try:
         return load_safely(path, env, algorithm=KNOWN_ALGORITHMS[algo], **kwargs)
     except UnsafeFileError as error:
         raise UnsafeFileError(on_the_command_line(str(error))) from error
+
+
+def _load_with_temperature(
+    algorithm: type[OffPolicyAlgorithm], path: Path, env: VecEnv | None, **kwargs: Any
+) -> OffPolicyAlgorithm:
+    """Load as SB3 does, but also with another ``ent_coef``, where SAC fails or keeps the file's temperature."""
+    given = {"ent_coef": kwargs.pop("ent_coef")} if "ent_coef" in kwargs else {}
+    model: Any = algorithm.load(path, env=env, **kwargs)
+    if not given or given["ent_coef"] == model.ent_coef:
+        return model
+    saved = model.get_parameters()
+    vars(model).update({**dict.fromkeys(TEMPERATURE), **given})
+    model._setup_model()
+    new = model.get_parameters()
+    kept = {name: saved[name] for name in new if name not in TEMPERATURE}
+    model.set_parameters({**new, **kept}, device=model.device)
+    return model
 
 
 def needs_trust(path: Path, algo: str) -> bool:

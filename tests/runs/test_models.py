@@ -36,6 +36,47 @@ def test_a_model_is_trained_further_with_the_arguments_of_a_new_one(tmp_path, en
         assert th.equal(further.policy.state_dict()[name], weights), name
 
 
+@pytest.mark.parametrize("trust", [False, True])
+@pytest.mark.parametrize("algo", ["sac", "tdc"])
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        ("auto_0.5", 0.1, 0.1),
+        (0.5, "auto_0.1", 0.1),
+        (0.5, 0.1, 0.1),
+        ("auto_0.5", "auto_0.1", 0.1),
+        ("auto_0.5", "auto_0.5", 0.25),  # unchanged: the value in the file
+        (0.5, 0.5, 0.25),
+    ],
+)
+def test_a_model_is_trained_further_with_another_temperature(tmp_path, env, before, after, expected, algo, trust):
+    head = {"stochastic_actor": True} if algo == "tdc" else {}
+    arguments = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 100, "learning_starts": 10, **head}
+    saved = make(algo, env, **arguments, ent_coef=before)
+    saved.learn(30)
+    with th.no_grad():
+        if saved.log_ent_coef is None:
+            saved.ent_coef_tensor.fill_(0.25)
+        else:
+            saved.log_ent_coef.copy_(th.tensor(0.25).log())
+    saved.save(tmp_path / "model.zip")
+    hyperparams = parse({"n_timesteps": 1, **arguments, "ent_coef": after}, KNOWN_ALGORITHMS[algo], "")
+    further = continue_model(tmp_path / "model.zip", algo, hyperparams, env, trust, device="cpu")
+    temperature = further.ent_coef_tensor if further.log_ent_coef is None else further.log_ent_coef.exp()
+    assert temperature.item() == pytest.approx(expected)
+    assert further.ent_coef == after
+    for name, weights in saved.policy.state_dict().items():
+        assert th.equal(further.policy.state_dict()[name], weights), name
+    for part in ("actor", "critic"):
+        moments = [getattr(each, part).optimizer.state_dict()["state"] for each in (saved, further)]
+        assert moments[0].keys() == moments[1].keys() != set()
+        for old, new in zip(*(each.values() for each in moments), strict=True):
+            assert th.equal(old["exp_avg_sq"], new["exp_avg_sq"])
+    further.learn(30)
+    if isinstance(after, str):  # the new temperature is learned
+        assert further.log_ent_coef.exp().item() != pytest.approx(expected, rel=1e-6)
+
+
 def make(algo, env, **arguments):
     return make_model(algo, parse({"n_timesteps": 1, **arguments}, KNOWN_ALGORITHMS[algo], ""), env, device="cpu")
 
