@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,25 @@ def check_within(limits: Limits, name: str, value: Any, shown_as: str = "") -> f
     if isinstance(minimum, int):
         return check_integer(shown_as or name, value, minimum, maximum)
     return check_number(shown_as or name, value, minimum, maximum)
+
+
+def check_layers(name: str, layers: Any, networks: Collection[str] = ()) -> None:
+    """
+    Check the units of hidden layers.
+
+    :param networks: names of the networks that may have layers of their own, in a dict
+    :raises ValueError: if it is not a list of integers of at least 1, nor a dict of such lists with these names; a
+        tuple counts as a list
+    """
+    is_dict = bool(networks) and isinstance(layers, dict) and layers.keys() == set(networks)
+    lists = layers.values() if is_dict else [layers]
+    if not all(isinstance(each, (list, tuple)) and all(_is_width(units) for units in each) for each in lists):
+        or_dict = f", or a dict of such lists for {' and '.join(networks)}" if networks else ""
+        raise ValueError(f"{name} must be a list of integers of at least 1{or_dict}, got {layers!r}")
+
+
+def _is_width(units: Any) -> bool:
+    return isinstance(units, (int, np.integer)) and not isinstance(units, bool) and int(units) >= 1
 
 
 def check_boolean(name: str, value: Any, or_none: bool = False) -> bool | None:

@@ -13,7 +13,15 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayB
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 
-from sb3_tdc.common.checks import ABOVE_ZERO, OFF_POLICY_LIMITS, Limits, check_action_space, check_number, check_within
+from sb3_tdc.common.checks import (
+    ABOVE_ZERO,
+    OFF_POLICY_LIMITS,
+    Limits,
+    check_action_space,
+    check_layers,
+    check_number,
+    check_within,
+)
 from sb3_tdc.common.off_policy import CheckedOffPolicyAlgorithm, discounts_of
 from sb3_tdc.common.saved_fields import SavedField, integer, number
 from sb3_tdc.meow.policies import CnnPolicy, MEOWPolicy, MlpPolicy, MultiInputPolicy
@@ -146,6 +154,9 @@ class MEOW(CheckedOffPolicyAlgorithm):
         arguments = self.policy_kwargs
         for name in ("n_shifts", "n_blocks", "dropout"):
             check_within(self.limits, name, arguments.get(name, 1), f"policy_kwargs[{name!r}]")
+        for name in ("net_arch", "shift_arch"):
+            if arguments.get(name) is not None:
+                check_layers(f"policy_kwargs[{name!r}]", arguments[name])
         low, high = arguments.get("log_std_min", -5.0), arguments.get("log_std_max", -0.3)
         low = check_number("policy_kwargs['log_std_min']", low)
         check_number("policy_kwargs['log_std_max']", high, low)

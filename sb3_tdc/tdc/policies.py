@@ -163,11 +163,13 @@ class TDCPolicy(TD3Policy):
         self.stochastic_actor = stochastic_actor
         if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
             optimizer_kwargs = {"fused": True}
+        if net_arch is None:
+            net_arch = [256, 256]
         super().__init__(
             observation_space,
             action_space,
             lr_schedule,
-            [256, 256] if net_arch is None else net_arch,
+            net_arch if isinstance(net_arch, dict) else list(net_arch),  # SB3 refuses a tuple
             activation_fn,
             features_extractor_class,
             features_extractor_kwargs,

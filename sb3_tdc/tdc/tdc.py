@@ -22,6 +22,7 @@ from sb3_tdc.common.checks import (
     Limits,
     check_action_space,
     check_boolean,
+    check_layers,
     check_number,
     check_within,
 )
@@ -228,6 +229,8 @@ class TDC(FusedUpdateAlgorithm):
         self._check_limits("kappa", "target_policy_noise", "target_noise_clip", "policy_delay")
         for name in ("n_quantiles", "n_critics"):
             check_within(self.limits, name, self.policy_kwargs.get(name, 1), f"policy_kwargs[{name!r}]")
+        if self.policy_kwargs.get("net_arch") is not None:
+            check_layers("policy_kwargs['net_arch']", self.policy_kwargs["net_arch"], ("pi", "qf"))
         self.target_entropy = self._current_target_entropy()
         self._initial_ent_coef()
         if "stochastic_actor" in self.policy_kwargs:

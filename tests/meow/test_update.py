@@ -217,6 +217,14 @@ def test_a_loss_that_is_not_finite_ends_training_and_is_not_saved(tmp_path):
         ({"tau": 2}, "tau must be a finite number between 0.0 and 1.0, got 2"),
         ({"learning_rate": lambda left: -left}, "learning_rate .a schedule, at progress remaining 1. must be"),
         ({"policy_kwargs": {"dropout": 1.5}}, "policy_kwargs.'dropout'. must be"),
+        *(
+            (
+                {"policy_kwargs": {name: layers}},
+                f"policy_kwargs.'{name}'. must be a list of integers of at least 1, got ",
+            )
+            for name in ("net_arch", "shift_arch")
+            for layers in (8, [0], [8.0], ["a"], {"pi": [8], "qf": [8]})
+        ),
         ({"policy_kwargs": {"n_shifts": 0}}, "policy_kwargs.'n_shifts'. must be an integer of at least 1"),
         ({"policy_kwargs": {"log_std_max": -6}}, "policy_kwargs.'log_std_max'. must be a finite number of at least -5"),
     ],

@@ -42,8 +42,8 @@ from tests.helpers.tdc import HEADS, BatchNormExtractor, TwoActions, assert_same
         {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
         {"policy_kwargs": {"n_critics": 1}},
         {"policy_kwargs": {"n_critics": 4, "n_quantiles": 1}},
-        {"policy_kwargs": {"net_arch": []}},
-        {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [32, 32, 32]}}},
+        {"policy_kwargs": {"net_arch": ()}},
+        {"policy_kwargs": {"net_arch": {"pi": [8], "qf": (32, 32, 32)}}},
         {"policy_kwargs": {"activation_fn": nn.Tanh, "optimizer_class": th.optim.AdamW}},
         {"policy_kwargs": {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}}},
         {"policy_kwargs": {"features_extractor_class": BatchNormExtractor}},
@@ -348,6 +348,24 @@ def test_diagnostics_by_hand():
             "stochastic_actor must be an argument of TDC itself",
         ),
         ({"policy_kwargs": {"n_critics": 0}}, r"policy_kwargs\['n_critics'\] must be an integer of at least 1, got 0"),
+        *(
+            (
+                {"policy_kwargs": {"net_arch": layers}},
+                r"policy_kwargs.'net_arch'. must be a list of integers of at least 1, or a dict of .* pi and qf, got ",
+            )
+            for layers in (
+                8,
+                [0],
+                [8, -1],
+                [8.0],
+                [True],
+                ["a"],
+                (8, 0),
+                {"pi": [8]},
+                {"pi": [8], "qf": 8},
+                [{"pi": [8]}],
+            )
+        ),
         ({"tau": 1.5}, "tau must be a finite number between 0.0 and 1.0, got 1.5"),
         ({"gamma": -0.5}, "gamma must be .* got -0.5"),
         ({"batch_size": 0}, "batch_size must be .* got 0"),
