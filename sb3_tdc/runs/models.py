@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
@@ -140,18 +141,19 @@ def load_model(path: Path, algo: str, env: VecEnv | None, trust: bool, **kwargs:
     """
     check_saved_by(path, algo)
     if trust:
-        return _load_with_temperature(KNOWN_ALGORITHMS[algo], path, env, **kwargs)
+        return _load_trusted(KNOWN_ALGORITHMS[algo], path, env, **kwargs)
     try:
         return load_safely(path, env, algorithm=KNOWN_ALGORITHMS[algo], **kwargs)
     except UnsafeFileError as error:
         raise UnsafeFileError(on_the_command_line(str(error))) from error
 
 
-def _load_with_temperature(
+def _load_trusted(
     algorithm: type[OffPolicyAlgorithm], path: Path, env: VecEnv | None, **kwargs: Any
 ) -> OffPolicyAlgorithm:
-    """Load as SB3 does, but also with another ``ent_coef``, where SAC fails or keeps the file's temperature."""
-    given = {"ent_coef": kwargs.pop("ent_coef")} if "ent_coef" in kwargs else {}
+    """Load as SB3 does, but SAC also with another ``ent_coef``: SB3 fails, or keeps the file's temperature."""
+    is_sac = issubclass(algorithm, SAC)
+    given = {"ent_coef": kwargs.pop("ent_coef")} if is_sac and "ent_coef" in kwargs else {}
     model: Any = algorithm.load(path, env=env, **kwargs)
     if not given or given["ent_coef"] == model.ent_coef:
         return model

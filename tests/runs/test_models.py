@@ -77,6 +77,19 @@ def test_a_model_is_trained_further_with_another_temperature(tmp_path, env, befo
         assert further.log_ent_coef.exp().item() != pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_temperature_that_is_never_learned_is_an_argument_like_others(tmp_path, env, trust):
+    arguments = {"policy_kwargs": {"net_arch": [8]}, "buffer_size": 100}
+    saved = make("meow", env, **arguments, ent_coef=0.5)
+    saved.save(tmp_path / "model.zip")
+    hyperparams = parse({"n_timesteps": 1, **arguments, "ent_coef": 0.1}, KNOWN_ALGORITHMS["meow"], "")
+    further = continue_model(tmp_path / "model.zip", "meow", hyperparams, env, trust, device="cpu")
+    assert further.ent_coef == 0.1
+    assert not vars(further).keys() & {"log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor"}
+    for name, weights in saved.policy.state_dict().items():
+        assert th.equal(further.policy.state_dict()[name], weights), name
+
+
 def make(algo, env, **arguments):
     return make_model(algo, parse({"n_timesteps": 1, **arguments}, KNOWN_ALGORITHMS[algo], ""), env, device="cpu")
 
