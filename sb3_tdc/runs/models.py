@@ -152,13 +152,14 @@ def _load_trusted(
     algorithm: type[OffPolicyAlgorithm], path: Path, env: VecEnv | None, **kwargs: Any
 ) -> OffPolicyAlgorithm:
     """Load as SB3 does, but SAC also with another ``ent_coef``: SB3 fails, or keeps the file's temperature."""
-    is_sac = issubclass(algorithm, SAC)
-    given = {"ent_coef": kwargs.pop("ent_coef")} if is_sac and "ent_coef" in kwargs else {}
+    if not issubclass(algorithm, SAC) or "ent_coef" not in kwargs:
+        return algorithm.load(path, env=env, **kwargs)
+    ent_coef = kwargs.pop("ent_coef")
     model: Any = algorithm.load(path, env=env, **kwargs)
-    if not given or given["ent_coef"] == model.ent_coef:
+    if model.ent_coef == ent_coef:
         return model
     saved = model.get_parameters()
-    vars(model).update({**dict.fromkeys(TEMPERATURE), **given})
+    vars(model).update({**dict.fromkeys(TEMPERATURE), "ent_coef": ent_coef})
     model._setup_model()
     new = model.get_parameters()
     kept = {name: saved[name] for name in new if name not in TEMPERATURE}
